@@ -1,0 +1,1 @@
+"""What every learner shares; it knows no environment and no configuration system."""

@@ -1,0 +1,211 @@
+"""A manager that commits to a skill for p steps: the policy, the commitment and Algorithm 1, HiPPO Rollout.
+
+HiPPO, HierVPG and MLSH train this same hierarchy and differ in what they do with a batch of it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import gymnasium as gym
+import torch
+from torch import Tensor, nn
+
+from hippo.core import seeding
+from hippo.core.policies import Manager, SkillPolicy, gaussian_entropy, sample_categorical
+from hippo.core.ppo import Level
+from hippo.core.rollout import Steps
+
+
+class HierarchyConfig(Protocol):
+    """The settings of a hierarchy; documented field by field in hippo.hippo.HippoConfig."""
+
+    horizon: int
+    num_skills: int
+    period_min: int
+    period_max: int
+    manager_hidden_sizes: list[int]
+    skill_hidden_sizes: list[int]
+    skill_integration: str
+    skill_observation: str
+    log_std_per_skill: bool
+    bootstrap_horizon: bool
+    truncate_to_period: bool
+
+
+def with_time(obs: Tensor, time_left: Tensor) -> Tensor:
+    """Append the time left as last entry: (..., D), (...) -> (..., D + 1)."""
+    return torch.cat([obs, time_left.unsqueeze(-1).to(obs.dtype)], -1)
+
+
+class HierarchicalPolicy(nn.Module):
+    """Manager and skills, and what each of them sees of an observation and the time left.
+
+    Only with a random period do the two see the time left (authors' code: fixed-p networks do not).
+    """
+
+    def __init__(
+        self, config: HierarchyConfig, obs_size: int, robot_size: int, action_size: int, generator: torch.Generator
+    ) -> None:
+        super().__init__()
+        self.num_skills = config.num_skills
+        self.skill_view = robot_size if config.skill_observation == "robot" else obs_size
+        self.sees_time = config.period_min < config.period_max
+        extra = int(self.sees_time)
+        self.manager = Manager(obs_size + extra, config.num_skills, config.manager_hidden_sizes, generator)
+        self.skills = SkillPolicy(
+            self.skill_view + extra,
+            config.num_skills,
+            action_size,
+            config.skill_hidden_sizes,
+            generator,
+            config.skill_integration,
+            config.log_std_per_skill,
+        )
+
+    def manager_input(self, obs: Tensor, time_left: Tensor) -> Tensor:
+        """(..., D), (...) -> (..., D [+ 1])."""
+        return with_time(obs, time_left) if self.sees_time else obs
+
+    def skill_input(self, obs: Tensor, time_left: Tensor) -> Tensor:
+        """(..., D), (...) -> (..., robot [+ 1])."""
+        view = obs[..., : self.skill_view]
+        return with_time(view, time_left) if self.sees_time else view
+
+
+class Commitment:
+    """Which skill every environment is committed to, and for how many more steps (Algorithm 1, lines 4 to 10)."""
+
+    def __init__(self, num_envs: int) -> None:
+        self.skill = torch.zeros(num_envs, dtype=torch.long)  # (N,)
+        self.steps_left = torch.zeros(num_envs, dtype=torch.long)  # (N,)
+
+    def renew(
+        self, policy: HierarchicalPolicy, obs: Tensor, period: Tensor, period_max: int, uniform: Tensor
+    ) -> Tensor:
+        """Where a commitment has run out take the new `period` (N,), then let the manager choose.
+
+        The period is drawn before the manager acts, so that the manager knows how long its choice will last.
+
+        Returns:
+            (N,) bool, where a decision was made.
+        """
+        is_decision = self.steps_left == 0
+        where = is_decision.nonzero().squeeze(-1)
+        if len(where):
+            self.steps_left[where] = period[where]
+            time_left = self.steps_left[where] / period_max
+            logits = policy.manager.logits(policy.manager_input(obs[where], time_left))
+            self.skill[where] = sample_categorical(logits, uniform[where])
+        return is_decision
+
+    def advance(self, done: Tensor) -> None:
+        """One environment step has passed; an episode's end cuts the commitment."""
+        self.steps_left -= 1
+        self.steps_left[done] = 0
+
+
+@dataclass
+class Batch:
+    """One iteration's experience of the hierarchy."""
+
+    steps: Steps  # observations, actions, rewards and ends
+    skill: Tensor  # (T + 1, N) the skill in force
+    time_left: Tensor  # (T + 1, N) steps left in the commitment, the coming one included, over period_max
+    is_decision: Tensor  # (T + 1, N) the manager chose here
+    used: Tensor  # (T, N) is learnt from; all true unless truncate_to_period
+
+
+@torch.no_grad()
+def collect(
+    policy: HierarchicalPolicy, envs: gym.vector.VectorEnv, config: HierarchyConfig, seed: int, iteration: int
+) -> Batch:
+    """Algorithm 1 in every environment, for one horizon from a fresh episode.
+
+    All randomness is drawn up front from streams named by (seed, iteration): periods, the manager's uniforms and the
+    skills' Gaussian noise, so what one level draws never shifts what the other draws.
+    """
+    T, N = config.horizon, envs.num_envs
+    steps = Steps(envs, T, config.bootstrap_horizon)
+    generator = seeding.torch_generator(seed, "period", iteration)
+    period = torch.randint(config.period_min, config.period_max + 1, (T + 1, N), generator=generator)
+    uniform = torch.rand(T + 1, N, generator=seeding.torch_generator(seed, "manager", iteration))
+    noise = torch.randn(steps.action.shape, generator=seeding.torch_generator(seed, "skills", iteration))
+    skill = torch.empty(T + 1, N, dtype=torch.long)
+    time_left = torch.empty(T + 1, N)
+    is_decision = torch.empty(T + 1, N, dtype=torch.bool)
+
+    commitment = Commitment(N)
+    steps.reset(seeding.integer(seed, "episodes", iteration))
+    for t in range(T + 1):
+        obs = steps.obs[t]
+        is_decision[t] = commitment.renew(policy, obs, period[t], config.period_max, uniform[t])
+        skill[t] = commitment.skill
+        time_left[t] = commitment.steps_left / config.period_max
+        if t < T:
+            steps.action[t] = policy.skills.act(policy.skill_input(obs, time_left[t]), skill[t], noise[t])
+            commitment.advance(steps.step(t))
+
+    used = torch.ones_like(steps.done)
+    if config.truncate_to_period:
+        used = in_whole_periods(is_decision[:T], config.period_max)
+    return Batch(steps, skill, time_left, is_decision, used)
+
+
+def in_whole_periods(is_decision: Tensor, period: int) -> Tensor:
+    """Which steps lie in a segment of full length: (T, N) decisions -> (T, N) bool."""
+    segment = is_decision.long().cumsum(0) - 1
+    length = torch.zeros_like(segment).scatter_add_(0, segment, torch.ones_like(segment))
+    return length.gather(0, segment) == period
+
+
+def levels(
+    policy: HierarchicalPolicy,
+    batch: Batch,
+    manager_advantage: Tensor,
+    skill_advantage: Tensor,
+    trained: Sequence[str] = ("manager", "skill"),
+) -> list[Level]:
+    """Log-probabilities and advantages of both levels: the manager at its decisions, the skills at every step.
+
+    Args:
+        manager_advantage, skill_advantage: (T, N). trained: the levels to return.
+    """
+    result = []
+    obs, skill, time_left = batch.steps.obs[:-1], batch.skill[:-1], batch.time_left[:-1]
+    if "manager" in trained:
+        where = batch.is_decision[:-1] & batch.used
+        manager_input, choice = policy.manager_input(obs[where], time_left[where]), skill[where].unsqueeze(-1)
+
+        def manager_log_prob(c: slice) -> Tensor:
+            return policy.manager.log_probs(manager_input[c]).gather(-1, choice[c]).squeeze(-1)
+
+        result.append(Level("manager", manager_log_prob, manager_advantage[where].to(obs.dtype)))
+    if "skill" in trained:
+        used = batch.used
+        order = skill[used].argsort(stable=True)  # the skill network wants its rows sorted by skill
+        skill_input = policy.skill_input(obs[used], time_left[used])[order]
+        active, action = skill[used][order], batch.steps.action[used][order]
+
+        def skill_log_prob(c: slice) -> Tensor:
+            return policy.skills.log_prob(skill_input[c], active[c], action[c])
+
+        result.append(Level("skill", skill_log_prob, skill_advantage[used][order].to(obs.dtype)))
+    return result
+
+
+@torch.no_grad()
+def policy_statistics(policy: HierarchicalPolicy, batch: Batch) -> dict[str, float]:
+    """How the hierarchy behaved in a batch: entropies, commitment length, action noise, use of every skill."""
+    skill, is_decision = batch.skill[:-1], batch.is_decision[:-1]
+    usage = torch.bincount(skill.flatten(), minlength=policy.num_skills) / skill.numel()
+    decided = policy.manager_input(batch.steps.obs[:-1][is_decision], batch.time_left[:-1][is_decision])
+    log_probs = policy.manager.log_probs(decided)
+    log_std = policy.skills.log_std()
+    return {
+        "manager_entropy": float(-(log_probs.exp() * log_probs).sum(-1).mean()),
+        "skill_entropy": float(usage @ gaussian_entropy(log_std)),
+        "action_std": float(log_std.exp().mean()),
+        "commitment_mean": float(skill.numel() / is_decision.sum()),
+        **{f"skill_{z}_usage": float(share) for z, share in enumerate(usage)},
+    }

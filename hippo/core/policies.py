@@ -1,0 +1,172 @@
+"""Policies: a flat Gaussian, the manager's categorical and the skill network (paper section 2 and appendix A).
+
+All nets are tanh multilayer perceptrons with Glorot-uniform weights and zero biases, as in the authors' code. Standard
+deviations do not depend on the state.
+"""
+
+import itertools
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+MIN_STD = 1e-4  # floor of the standard deviation (authors' code)
+
+
+def linear(inputs: int, outputs: int, generator: torch.Generator) -> nn.Linear:
+    """A linear layer with Glorot-uniform weights and zero bias."""
+    layer = nn.Linear(inputs, outputs)
+    with torch.no_grad():
+        nn.init.xavier_uniform_(layer.weight, generator=generator)
+        layer.bias.zero_()
+    return layer
+
+
+def mlp(sizes: Sequence[int], generator: torch.Generator, activation: type[nn.Module] = nn.Tanh) -> nn.Sequential:
+    """Layers sizes[0] -> ... -> sizes[-1] with `activation` between them and none after the last."""
+    layers: list[nn.Module] = []
+    for inputs, outputs in itertools.pairwise(sizes):
+        layers += [linear(inputs, outputs, generator), activation()]
+    return nn.Sequential(*layers[:-1])
+
+
+def gaussian_log_prob(mean: Tensor, log_std: Tensor, action: Tensor) -> Tensor:
+    """log N(action; mean, diag(exp(log_std)^2)): (..., A) -> (...)."""
+    residual = (action - mean) * torch.exp(-log_std)
+    constant = 0.5 * action.shape[-1] * math.log(2 * math.pi)
+    return -0.5 * residual.square().sum(-1) - log_std.sum(-1) - constant
+
+
+def gaussian_entropy(log_std: Tensor) -> Tensor:
+    """Differential entropy of a diagonal Gaussian: (..., A) -> (...)."""
+    return log_std.sum(-1) + 0.5 * log_std.shape[-1] * (1 + math.log(2 * math.pi))
+
+
+def sample_categorical(logits: Tensor, uniform: Tensor) -> Tensor:
+    """Inverse-CDF sample: logits (K, Z) and uniform (K,) in [0, 1) -> indices (K,)."""
+    cumulative = logits.softmax(-1).cumsum(-1)
+    return (uniform.unsqueeze(-1) >= cumulative).sum(-1).clamp_(max=logits.shape[-1] - 1)
+
+
+class GaussianPolicy(nn.Module):
+    """The flat policy pi(a|s): mean from an MLP, one trainable log-std vector."""
+
+    def __init__(
+        self, obs_size: int, action_size: int, hidden_sizes: Sequence[int], generator: torch.Generator
+    ) -> None:
+        super().__init__()
+        self.mean = mlp([obs_size, *hidden_sizes, action_size], generator)
+        self.log_std_parameter = nn.Parameter(torch.zeros(action_size))
+
+    @property
+    def log_std(self) -> Tensor:
+        """(A,) log standard deviation, floored."""
+        return self.log_std_parameter.clamp(min=math.log(MIN_STD))
+
+    def log_prob(self, obs: Tensor, action: Tensor) -> Tensor:
+        """log pi(a|s): (B, D), (B, A) -> (B,)."""
+        return gaussian_log_prob(self.mean(obs), self.log_std, action)
+
+    def act(self, obs: Tensor, noise: Tensor) -> Tensor:
+        """Action for standard normal `noise`: (N, D), (N, A) -> (N, A)."""
+        return self.mean(obs) + self.log_std.exp() * noise
+
+
+class Manager(nn.Module):
+    """The higher level pi_h(z|s): a categorical over skills."""
+
+    def __init__(self, obs_size: int, num_skills: int, hidden_sizes: Sequence[int], generator: torch.Generator) -> None:
+        super().__init__()
+        self.logits = mlp([obs_size, *hidden_sizes, num_skills], generator)
+
+    def log_probs(self, obs: Tensor) -> Tensor:
+        """log pi_h(.|s) of every skill: (B, D) -> (B, Z)."""
+        return self.logits(obs).log_softmax(-1)
+
+
+class SkillLinear(nn.Module):
+    """First layer over an input x and a one-hot skill z, either [x, z, x (x) z] ("bilinear") or [x, z] ("concatenate").
+
+    The product is flattened with x major (entry i Z + j is x_i z_j), as in the authors' network. As z is one-hot the
+    layer is an ordinary linear layer whose weight depends on the skill, and that is how it is computed.
+    """
+
+    def __init__(
+        self, inputs: int, num_skills: int, outputs: int, integration: str, generator: torch.Generator
+    ) -> None:
+        super().__init__()
+        if integration not in ("bilinear", "concatenate"):
+            raise ValueError(f"integration={integration}: must be one of bilinear, concatenate")
+        self.inputs, self.num_skills, self.integration = inputs, num_skills, integration
+        width = inputs + num_skills + (inputs * num_skills if integration == "bilinear" else 0)
+        layer = linear(width, outputs, generator)
+        self.weight, self.bias = layer.weight, layer.bias  # (H, width), (H,)
+
+    def effective(self) -> tuple[Tensor, Tensor]:
+        """The weight (Z, D, H) and the bias (Z, H) that the one-hot input leaves for each skill."""
+        D, Z = self.inputs, self.num_skills
+        weight = self.weight[:, :D].T.unsqueeze(0)  # (1, D, H)
+        if self.integration == "bilinear":
+            weight = weight + self.weight[:, D + Z :].view(-1, D, Z).permute(2, 1, 0)
+        return weight.expand(Z, -1, -1), self.bias + self.weight[:, D : D + Z].T
+
+    def forward(self, x: Tensor, skill: Tensor) -> Tensor:
+        """Rows in any order: (B, D), (B,) -> (B, H). Computes every skill; meant for small batches."""
+        return self.all_skills(x)[torch.arange(len(x)), skill]
+
+    def all_skills(self, x: Tensor) -> Tensor:
+        """The layer under every skill: (B, D) -> (B, Z, H)."""
+        weight, bias = self.effective()
+        flat = x @ weight.permute(1, 0, 2).reshape(self.inputs, -1)
+        return flat.view(len(x), self.num_skills, -1) + bias
+
+    def grouped(self, x: Tensor, counts: Sequence[int]) -> Tensor:
+        """Rows sorted by skill, `counts[z]` of each: (B, D) -> (B, H). One matrix product per skill."""
+        weight, bias = self.effective()
+        parts = x.split(list(counts))
+        return torch.cat([torch.addmm(bias[z], part, weight[z]) for z, part in enumerate(parts)])
+
+
+class SkillPolicy(nn.Module):
+    """The lower level pi_l(a|s, z): one network for all skills (paper section 4.1).
+
+    The input is what skills may see (the robot's own observation by default) and, with a random period, the time left
+    in the commitment as last entry.
+    """
+
+    def __init__(
+        self,
+        obs_size: int,
+        num_skills: int,
+        action_size: int,
+        hidden_sizes: Sequence[int],
+        generator: torch.Generator,
+        integration: str = "bilinear",
+        log_std_per_skill: bool = False,
+    ) -> None:
+        super().__init__()
+        self.num_skills = num_skills
+        self.first = SkillLinear(obs_size, num_skills, hidden_sizes[0], integration, generator)
+        self.rest = nn.Sequential(nn.Tanh(), mlp([*hidden_sizes, action_size], generator))
+        rows = num_skills if log_std_per_skill else 1
+        self.log_std_parameter = nn.Parameter(torch.zeros(rows, action_size))
+
+    def log_std(self) -> Tensor:
+        """(Z, A) log standard deviation of every skill, floored."""
+        return self.log_std_parameter.clamp(min=math.log(MIN_STD)).expand(self.num_skills, -1)
+
+    def act(self, obs: Tensor, skill: Tensor, noise: Tensor) -> Tensor:
+        """Action for standard normal `noise`: (N, D), (N,), (N, A) -> (N, A)."""
+        return self.rest(self.first(obs, skill)) + self.log_std().exp()[skill] * noise
+
+    def log_prob(self, obs: Tensor, skill: Tensor, action: Tensor) -> Tensor:
+        """log pi_l(a|s, z) of rows *sorted by skill*: (B, D), (B,), (B, A) -> (B,)."""
+        counts = torch.bincount(skill, minlength=self.num_skills).tolist()
+        mean = self.rest(self.first.grouped(obs, counts))
+        return gaussian_log_prob(mean, self.log_std()[skill], action)
+
+    def log_prob_all(self, obs: Tensor, action: Tensor) -> Tensor:
+        """log pi_l(a|s, z) under every skill: (B, D), (B, A) -> (B, Z)."""
+        mean = self.rest(self.first.all_skills(obs))  # (B, Z, A)
+        return gaussian_log_prob(mean, self.log_std(), action.unsqueeze(1))

@@ -1,0 +1,98 @@
+"""What every on-policy learner records of T steps of N environments, and how the end of an episode is read.
+
+An iteration starts with a fresh episode in every environment and takes one horizon of steps. An episode that ends early
+is followed by a new one in its place; what the end of the batch cuts is bootstrapped, the horizon itself is not (the
+paper's MDP has a finite horizon) unless `bootstrap_horizon` says so.
+"""
+
+import time
+
+import gymnasium as gym
+import numpy as np
+import torch
+from torch import Tensor
+
+from hippo.core.episodes import episode_statistics
+from hippo.core.log import check_finite
+
+
+class Steps:
+    """Arrays of one iteration, filled by `reset` and then `step` for t = 0 .. T - 1."""
+
+    def __init__(self, envs: gym.vector.VectorEnv, num_steps: int, bootstrap_horizon: bool = False) -> None:
+        T, N = num_steps, envs.num_envs
+        obs_size = envs.single_observation_space.shape[0]  # type: ignore[index]
+        action_size = envs.single_action_space.shape[0]  # type: ignore[index]
+        self.envs, self.bootstrap_horizon = envs, bootstrap_horizon
+        self.obs = torch.empty(T + 1, N, obs_size)  # the last row follows the last step
+        self.action = torch.empty(T, N, action_size)
+        self.reward = torch.empty(T, N, dtype=torch.float64)
+        self.terminated = torch.empty(T, N, dtype=torch.bool)  # nothing follows the step
+        self.done = torch.empty(T, N, dtype=torch.bool)  # the episode ended with the step
+        self._final: list[tuple[int, np.ndarray, np.ndarray]] = []
+        self.diverged = 0  # simulations that diverged
+        self.penalty = 0.0  # velocity penalty summed over all steps
+        self.physics_seconds = 0.0  # spent inside the environments
+
+    def reset(self, seed: int) -> None:
+        """Start a fresh episode in every environment."""
+        obs, _ = self.envs.reset(seed=seed)
+        self.obs[0] = torch.from_numpy(obs)
+
+    def step(self, t: int) -> Tensor:
+        """Take `action[t]` (N, A) and record what follows; returns which episodes ended (N,) bool."""
+        start = time.perf_counter()
+        obs, reward, terminated, truncated, info = self.envs.step(self.action[t].numpy())
+        self.physics_seconds += time.perf_counter() - start
+        self.obs[t + 1] = torch.from_numpy(obs)
+        self.reward[t] = torch.from_numpy(reward)
+        done = terminated | truncated
+        if done.any():
+            self.diverged += int(info["diverged"].sum())
+            if self.bootstrap_horizon:
+                bootstrapped = truncated & ~info["diverged"]
+                where = np.flatnonzero(bootstrapped)
+                self._final.append((t, where, info["final_obs"][where]))
+                terminated = done & ~bootstrapped
+            else:
+                terminated = done
+        if "velocity_penalty" in info:
+            self.penalty += float(info["velocity_penalty"].sum())
+        self.terminated[t] = torch.from_numpy(terminated)
+        self.done[t] = torch.from_numpy(done)
+        return self.done[t]
+
+    @property
+    def num_steps(self) -> int:
+        """Environment steps taken, T N."""
+        return self.reward.numel()
+
+    def final(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Of the E episodes whose horizon is bootstrapped: last observation (E, D), step (E,) and environment (E,)."""
+        if not self._final:
+            return self.obs[:0, 0], torch.empty(0, dtype=torch.long), torch.empty(0, dtype=torch.long)
+        step = torch.cat([torch.full((len(where),), t) for t, where, _ in self._final])
+        env = torch.from_numpy(np.concatenate([where for _, where, _ in self._final]))
+        return torch.from_numpy(np.concatenate([obs for _, _, obs in self._final])), step, env
+
+    def statistics(self) -> dict[str, float | int]:
+        """Returns and lengths of the episodes, the velocity penalty per environment, diverged simulations."""
+        return {
+            **episode_statistics(self.reward.numpy(), self.done.numpy()),
+            "velocity_penalty": self.penalty / self.reward.shape[1],
+            "diverged_simulations": self.diverged,
+        }
+
+    def check(self, iteration: int) -> None:
+        """Raise Diverged where an observation or a reward is not finite."""
+        check_finite(iteration, observations=self.obs, rewards=self.reward)
+
+    def timing(self, start: float, collected: float, end: float) -> dict[str, float]:
+        """Where the seconds between `start`, `collected` and `end` (perf_counter) of an iteration went."""
+        return {
+            "seconds": end - start,
+            "steps_per_second": self.num_steps / (end - start),
+            "physics_seconds": self.physics_seconds,
+            "policy_seconds": collected - start - self.physics_seconds,
+            "update_seconds": end - collected,
+        }

@@ -1,0 +1,134 @@
+"""Value functions: the single baseline V(s) and the skill-conditioned baseline V(s, z, time left) of section 4.2.
+
+Two hidden layers of 32 ReLU units, inputs and target standardised with the statistics of the batch they are fitted to,
+as in the authors' code (GaussianMLPRegressor). Departure, *ours*: the authors minimise a Gaussian likelihood by L-BFGS
+under a KL trust region; here it is the mean squared error by plain L-BFGS, warm-started at the last iteration's
+weights and limited to a number of loss evaluations, which bounds the cost of an iteration.
+"""
+
+import contextlib
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from hippo.core.normalize import Standardizer
+from hippo.core.policies import SkillLinear, linear, mlp
+from hippo.core.ppo import chunks, in_chunks
+
+
+class _BudgetSpent(Exception):
+    """Leaves L-BFGS in the middle of a line search once all loss evaluations are used."""
+
+
+class ValueFunction(nn.Module):
+    """V(x), or V(x, z) where `num_skills` is given; predicts zero until it has been fitted once.
+
+    With skills the first layer's input is [x, z, x (x) z], where x already holds the remaining time.
+    """
+
+    def __init__(
+        self, input_size: int, hidden_sizes: Sequence[int], generator: torch.Generator, num_skills: int = 0
+    ) -> None:
+        super().__init__()
+        self.num_skills = num_skills
+        self.first: nn.Linear | SkillLinear
+        if num_skills:
+            self.first = SkillLinear(input_size, num_skills, hidden_sizes[0], "bilinear", generator)
+        else:
+            self.first = linear(input_size, hidden_sizes[0], generator)
+        self.rest = nn.Sequential(nn.ReLU(), mlp([*hidden_sizes, 1], generator, nn.ReLU))
+        self.inputs, self.target = Standardizer(input_size), Standardizer(1)
+        self.is_fitted: Tensor
+        self.register_buffer("is_fitted", torch.tensor(False))
+
+    def _standardized(self, x: Tensor, skill: Tensor | None) -> Tensor:
+        """Standardised values of standardised rows sorted by skill: (B, D), (B,) -> (B,)."""
+        if isinstance(self.first, SkillLinear):
+            assert skill is not None
+            hidden = self.first.grouped(x, torch.bincount(skill, minlength=self.num_skills).tolist())
+        else:
+            hidden = self.first(x)
+        return self.rest(hidden).squeeze(-1)
+
+    def _sorted(self, x: Tensor, skill: Tensor | None) -> tuple[Tensor, Tensor | None, Tensor | None]:
+        if not self.num_skills:
+            return x, None, None
+        if skill is None:
+            raise ValueError("this value function is conditioned on the skill: pass the skill of every row")
+        order = skill.argsort(stable=True)
+        return x[order], skill[order], order
+
+    def predict(self, x: Tensor, skill: Tensor | None = None) -> Tensor:
+        """Values: (..., D) and, with skills, (...) -> (...) in float64, without gradients."""
+        shape, x = x.shape[:-1], x.reshape(-1, x.shape[-1])
+        if not self.is_fitted:
+            return torch.zeros(shape, dtype=torch.float64)
+        rows, sorted_skill, order = self._sorted(x, None if skill is None else skill.reshape(-1))
+
+        def part(c: slice) -> Tensor:
+            return self._standardized(self.inputs(rows[c]), None if sorted_skill is None else sorted_skill[c])
+
+        value = in_chunks(part, len(rows))
+        if order is not None:
+            value = torch.empty_like(value).index_copy_(0, order, value)
+        return self.target.invert(value.double()).reshape(shape)
+
+    def fit(self, x: Tensor, target: Tensor, evaluations: int, skill: Tensor | None = None) -> float:
+        """Regress on `target`: (B, D), (B,) and, with skills, (B,).
+
+        Args:
+            evaluations: the most loss-and-gradient evaluations that may be used; the best weights seen are kept.
+
+        Returns:
+            The standardised mean squared error of the kept weights (0 is perfect, 1 is the batch mean).
+        """
+        self.inputs.fit(x)
+        self.target.fit(target.unsqueeze(-1))
+        rows, sorted_skill, order = self._sorted(x, skill)
+        if order is not None:
+            target = target[order]
+        rows = self.inputs(rows)
+        goal = self.target(target.unsqueeze(-1).double()).squeeze(-1).to(rows.dtype)
+        parameters = list(self.parameters())
+        best_loss, best = float("inf"), [p.detach().clone() for p in parameters]
+        used = 0
+
+        def closure() -> float:
+            nonlocal best_loss, used
+            if used == evaluations:
+                raise _BudgetSpent
+            used += 1
+            for p in parameters:
+                p.grad = None
+            total = 0.0
+            for c in chunks(len(rows)):
+                prediction = self._standardized(rows[c], None if sorted_skill is None else sorted_skill[c])
+                loss = (prediction - goal[c]).square().sum() / len(rows)
+                loss.backward()
+                total += float(loss.detach())
+            if total < best_loss:
+                best_loss = total
+                for kept, p in zip(best, parameters, strict=True):
+                    kept.copy_(p.detach())
+            return total
+
+        optimizer = torch.optim.LBFGS(
+            parameters, max_iter=evaluations, max_eval=evaluations, history_size=10, line_search_fn="strong_wolfe"
+        )
+        with contextlib.suppress(_BudgetSpent):
+            optimizer.step(closure)
+        with torch.no_grad():
+            for kept, p in zip(best, parameters, strict=True):
+                p.copy_(kept)
+                p.grad = None
+        self.is_fitted.fill_(True)
+        return best_loss
+
+
+def explained_variance(prediction: Tensor, target: Tensor) -> float:
+    """1 - Var(target - prediction) / Var(target); 0 where the target does not vary."""
+    variance = target.var(correction=0)
+    if variance == 0:
+        return 0.0
+    return float(1 - (target - prediction).var(correction=0) / variance)
