@@ -1,34 +1,20 @@
 """Advantages of both levels and the baselines they come from (paper section 4.2, Lemma 2)."""
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import torch
 from torch import Tensor, nn
 
 from hippo.core.gae import gae, segment_gae
-from hippo.core.hierarchy import Batch, with_time
+from hippo.core.hierarchy import Batch, HierarchyConfig, with_time
 from hippo.core.normalize import standardize
 from hippo.core.value import ValueFunction, explained_variance
-
-
-class AdvantageConfig(Protocol):
-    """The settings of advantage estimation; documented field by field in hippo.hippo.HippoConfig."""
-
-    num_skills: int
-    skill_baseline: str
-    manager_baseline: str
-    manager_advantage: str
-    gamma: float
-    gae_lambda: float
-    value_hidden_sizes: list[int]
-    value_iterations: int
 
 
 class Baselines(nn.Module):
     """V(s) and V(s, z, time left); a baseline of either kind leaves the expected gradient unchanged (Lemma 2)."""
 
-    def __init__(self, config: AdvantageConfig, obs_size: int, generator: torch.Generator) -> None:
+    def __init__(self, config: HierarchyConfig, obs_size: int, generator: torch.Generator) -> None:
         super().__init__()
         self.evaluations = config.value_iterations
         self.single = ValueFunction(obs_size, config.value_hidden_sizes, generator)
@@ -62,7 +48,7 @@ class Advantages:
     explained_variance: dict[str, float]  # per baseline in use: of its prediction before it saw this batch
 
 
-def advantages(batch: Batch, baselines: Baselines, config: AdvantageConfig) -> Advantages:
+def advantages(batch: Batch, baselines: Baselines, config: HierarchyConfig) -> Advantages:
     """Advantages of both levels, from the baselines as fitted to the *previous* iteration's batch.
 
     At a segment's end the next skill value is that of the newly drawn (z, time left), which is what follows there. With

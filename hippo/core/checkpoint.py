@@ -33,7 +33,7 @@ def save(path: Path, state: dict[str, Any], previous: Path | None = None) -> Non
     buffer = io.BytesIO()
     torch.save(state, buffer)
     payload = buffer.getvalue()
-    temporary = path.with_name(f"{path.name}.{os.getpid()}.tmp")
+    temporary = path.with_name(path.name + ".tmp")  # what a kill leaves behind the next save overwrites
     try:
         with temporary.open("wb") as file:
             file.write(MAGIC + hashlib.sha256(payload).digest() + payload)

@@ -3,9 +3,9 @@
 HiPPO, HierVPG and MLSH train this same hierarchy and differ in what they do with a batch of it.
 """
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import gymnasium as gym
 import torch
@@ -15,22 +15,105 @@ from hippo.core import seeding
 from hippo.core.policies import Manager, SkillPolicy, gaussian_entropy, sample_categorical
 from hippo.core.ppo import Level
 from hippo.core.rollout import Steps
+from hippo.core.settings import ConfigError, check, setting
 
 
-class HierarchyConfig(Protocol):
-    """The settings of a hierarchy; documented field by field in hippo.hippo.HippoConfig."""
+@dataclass
+class HierarchyConfig:
+    """What every algorithm that trains a hierarchy sets: budget, commitment, networks, baselines, discounting.
 
-    horizon: int
-    num_skills: int
-    period_min: int
-    period_max: int
-    manager_hidden_sizes: list[int]
-    skill_hidden_sizes: list[int]
-    skill_integration: str
-    skill_observation: str
-    log_std_per_skill: bool
-    bootstrap_horizon: bool
-    truncate_to_period: bool
+    The defaults are the paper's and, where it is silent, the authors' code's.
+    """
+
+    iterations: int = setting(dataclasses.MISSING, "training iterations", code="2000 on Gather (README)", low=1)
+    batch_size: int = setting(
+        dataclasses.MISSING, "environment steps per iteration", paper="Block 50 000, Gather 100 000 (App. A)", low=1
+    )
+    horizon: int = setting(
+        dataclasses.MISSING, "episode length H in steps", paper="Block 1000, Ant 5000, Snake 8000 (App. A)", low=1
+    )
+    num_skills: int = setting(6, "number of skills n", paper="6 (App. A)", code="6 (pg_test.py:332)", low=1)
+    period_min: int = setting(
+        5, "shortest commitment in steps; equal to period_max: a fixed period", paper="5 (App. A)", low=1
+    )
+    period_max: int = setting(15, "longest commitment in steps, inclusive", paper="15 (App. A)", low=1)
+    skill_baseline: str = setting(
+        "skill",
+        "baseline of the skills: V(s, z, time left), the manager's V(s), or none",
+        paper="skill-dependent (section 4.2, Fig. 4)",
+        code="-sbl",
+        choices=("skill", "single", "none"),
+    )
+    manager_baseline: str = setting(
+        "single",
+        "baseline of the manager: V(s) or none",
+        paper="single (section 4.2)",
+        choices=("single", "none"),
+    )
+    gamma: float = setting(
+        0.999, "discount per environment step", paper="0.999 (App. A)", code="0.99, 0.999 by flag", above=0, high=1
+    )
+    gae_lambda: float = setting(
+        1.0, "GAE lambda", paper="cites GAE, gives no value", code="1 (hier_batch_polopt.py:55)", low=0, high=1
+    )
+    manager_advantage: str = setting(
+        "step",
+        "advantage of a decision: the per-step advantage where it is made, or semi-Markov GAE; equal for lambda 1",
+        code="step (hippo2.py:186)",
+        choices=("step", "smdp"),
+    )
+    bootstrap_horizon: bool = setting(
+        False,
+        "whether the end of the horizon bootstraps the value",
+        paper="finite-horizon MDP (section 2)",
+        code="no (hier_base.py:57)",
+    )
+    manager_hidden_sizes: list[int] = setting([32, 32], "manager's hidden layers", paper="2 x 32 (App. A)", low=1)
+    skill_hidden_sizes: list[int] = setting([64, 64], "skill network's hidden layers", paper="2 x 64 (App. A)", low=1)
+    value_hidden_sizes: list[int] = setting([32, 32], "hidden layers of both baselines", paper="2 x 32 (App. A)", low=1)
+    value_iterations: int = setting(
+        20,
+        "loss evaluations per baseline and iteration",
+        code="KL-constrained L-BFGS, up to 20 iterations x 10 penalties",
+        ours="one warm-started L-BFGS bounds the cost of an iteration",
+        low=1,
+    )
+    skill_integration: str = setting(
+        "bilinear",
+        "how the skill enters the skill network",
+        code="bilinear (pg_test.py:157)",
+        choices=("bilinear", "concatenate"),
+    )
+    skill_observation: str = setting(
+        "robot",
+        "what skills see: the robot's own observation or everything",
+        paper="pi(a|s, z), silent",
+        code="robot (test2_hier_snn_mlp_policy.py:180)",
+        choices=("robot", "full"),
+    )
+    log_std_per_skill: bool = setting(
+        False, "one log-std vector per skill instead of a shared one", code="shared (test2_hier_snn_mlp_policy.py:226)"
+    )
+    truncate_to_period: bool = setting(
+        False,
+        "do not learn from the steps of an episode after its last whole period, as the authors with fixed p",
+        code="yes for fixed p (hier_batch_sampler.py:36)",
+        ours="no: it hides about 90 % of the Ant's falls at p = 10",
+    )
+
+    def __post_init__(self) -> None:
+        check(self)
+        if self.period_min > self.period_max:
+            raise ConfigError("period_min", self.period_min, f"must be at most period_max={self.period_max}")
+        if self.batch_size < self.horizon:
+            raise ConfigError("batch_size", self.batch_size, f"must be at least one horizon, {self.horizon} steps")
+        if self.truncate_to_period and self.period_min < self.period_max:
+            raise ConfigError("truncate_to_period", True, "needs a fixed period (period_min = period_max)")
+
+    @property
+    def num_envs(self) -> int:
+        """Slots that collect one horizon each; ceil(batch / horizon)."""
+        return -(-self.batch_size // self.horizon)
 
 
 def with_time(obs: Tensor, time_left: Tensor) -> Tensor:

@@ -62,7 +62,7 @@ class ValueFunction(nn.Module):
     def predict(self, x: Tensor, skill: Tensor | None = None) -> Tensor:
         """Values: (..., D) and, with skills, (...) -> (...) in float64, without gradients."""
         shape, x = x.shape[:-1], x.reshape(-1, x.shape[-1])
-        if not self.is_fitted:
+        if not self.is_fitted or not len(x):
             return torch.zeros(shape, dtype=torch.float64)
         rows, sorted_skill, order = self._sorted(x, None if skill is None else skill.reshape(-1))
 

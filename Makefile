@@ -1,0 +1,62 @@
+# The front door. `make help` lists the targets; every target installs what it needs first.
+#   SCALE=smoke|laptop|paper   LAUNCHER=local|slurm   FRESH=1 (ignore committed results)   YES=1 (agree to large plans)
+
+SHELL := /bin/bash
+.DELETE_ON_ERROR:
+.DEFAULT_GOAL := help
+
+PYTHON ?= python3
+SCALE ?= smoke
+LAUNCHER ?= local
+RUNS_DIR ?= runs
+BIN := .venv/bin
+RUN = $(BIN)/python -m
+
+SWEEP_FLAGS = --scale $(SCALE) --launcher $(LAUNCHER) --runs-dir $(RUNS_DIR) $(if $(FRESH),--fresh) $(if $(YES),--yes)
+DRAW_FLAGS = --scale $(SCALE) --runs-dir $(RUNS_DIR)
+
+TRAINED := $(sort $(basename $(notdir $(wildcard experiments/conf/figure/*.yaml))))
+FIGURES := $(filter fig%,$(basename $(notdir $(wildcard paper_figures/fig*.py))))
+TABLES := $(filter table%,$(basename $(notdir $(wildcard paper_figures/table*.py))))
+
+install: .venv/installed  ## make .venv with the locked versions (nothing to do when nothing changed)
+
+.venv/installed: requirements.lock pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "Python >= 3.11 is needed; set PYTHON=..." >&2; exit 2; }
+	$(PYTHON) -m venv .venv
+	$(BIN)/pip install --quiet --disable-pip-version-check --requirement requirements.lock
+	$(BIN)/pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
+	@touch $@
+
+$(FIGURES) $(TABLES): install
+	@if [ -f experiments/conf/figure/$@.yaml ]; then $(RUN) experiments.sweep run $@ $(SWEEP_FLAGS); fi
+	@$(RUN) paper_figures.$@ $(DRAW_FLAGS)
+
+all: $(FIGURES) $(TABLES)  ## every figure and table at SCALE
+
+plan-%: install
+	@$(RUN) experiments.sweep plan $* $(SWEEP_FLAGS)
+
+lint: install  ## ruff (format and rules) and mypy
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+
+test: install  ## the fast tests (what CI runs)
+	$(RUN) pytest -m "not slow and not slurm"
+
+smoke: fig3  ## train and draw Figure 3 at smoke scale
+
+bench: install  ## steps per second as ratios within one run, with a table
+	$(RUN) experiments.bench
+
+clean:  ## remove what was installed and trained here (asks nothing)
+	rm -rf .venv runs paper_figures/out build *.egg-info
+
+help:  ## this list
+	@awk -F ':.*## ' '/^[a-z%-]+:.*## / {printf "  make %-12s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+	@echo "  make figN        train what is missing and draw: $(FIGURES)"
+	@echo "  make tableN      the same for: $(or $(TABLES),none yet)"
+	@echo "  make plan-figN   what it would train and cost, without training"
+
+.PHONY: install all lint test smoke bench clean help $(FIGURES) $(TABLES)

@@ -1,0 +1,97 @@
+"""HierVPG: the approximate hierarchical policy gradient of the paper's section 4, applied directly (Fig. 5).
+
+The ablation of HiPPO without its trust region: one full-batch step per iteration on
+
+    E[ sum_k log pi_h(z_k|s_k) A_k  +  sum_t log pi_l(a_t|s_t, z_k) A_t ].
+
+At the policy that collected the batch this is the gradient of HiPPO's surrogate; the two differ in that HiPPO goes on
+for more steps on the same batch, held back by clipping, and in the step size. Re-implemented from the formula: the
+authors' script (hierarchical_vpg.py) does not run as published.
+"""
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import nn
+
+from hippo.core import seeding
+from hippo.core.advantages import Baselines, advantages
+from hippo.core.checkpoint import Checkpoint
+from hippo.core.hierarchy import HierarchicalPolicy, HierarchyConfig, collect, levels, policy_statistics
+from hippo.core.log import RunLog, check_finite
+from hippo.core.ppo import Level, chunks
+from hippo.core.settings import setting
+
+REVISION = 1  # bumped by every change that alters the metrics of tests/golden
+
+MakeEnvs = Callable[[int, str], Any]  # (num_envs, purpose) -> a vector environment that knows its robot_size
+
+
+@dataclass
+class HierVPGConfig(HierarchyConfig):
+    """The settings of HierVPG beside those of its hierarchy."""
+
+    learning_rate: float = setting(
+        0.01, "Adam step size", paper="3e-3 for PPO and HiPPO (App. A)", code="0.01 (pg_test.py:508)", above=0.0
+    )
+
+
+def policy_gradient_step(policy_levels: Sequence[Level], optimizer: torch.optim.Optimizer, num_steps: int) -> float:
+    """One ascent step on sum over levels and rows of log pi A, over `num_steps`; returns that objective before it."""
+    optimizer.zero_grad(set_to_none=True)
+    objective = 0.0
+    for level in policy_levels:
+        for c in chunks(len(level.advantage)):
+            term = (level.log_prob(c) * level.advantage[c]).sum() / num_steps
+            (-term).backward()
+            objective += float(term.detach())
+    optimizer.step()
+    return objective
+
+
+def train(config: HierVPGConfig, make_envs: MakeEnvs, log: RunLog, seed: int, checkpoint: Checkpoint) -> None:
+    """Train from the newest checkpoint, or from scratch, to `config.iterations`.
+
+    Raises:
+        Diverged: an observation, a reward or a parameter is no longer finite.
+    """
+    envs = make_envs(config.num_envs, "training")
+    obs_size, action_size = envs.single_observation_space.shape[0], envs.single_action_space.shape[0]
+    generator = seeding.torch_generator(seed, "initialisation")
+    policy = HierarchicalPolicy(config, obs_size, envs.robot_size, action_size, generator)
+    baselines = Baselines(config, obs_size, generator)
+    optimizer = torch.optim.Adam(policy.parameters(), lr=config.learning_rate)
+
+    parts = {"policy": policy, "baselines": baselines, "optimizer": optimizer}
+    first = checkpoint.restore(**parts)
+    log.resume(first)
+
+    for iteration in range(first, config.iterations):
+        start = time.perf_counter()
+        batch = collect(policy, envs, config, seed, iteration)
+        steps = batch.steps
+        steps.check(iteration)
+        collected = time.perf_counter()
+        statistics = policy_statistics(policy, batch)  # of the policy that collected, before its update
+        estimate = advantages(batch, baselines, config)
+        objective = policy_gradient_step(
+            levels(policy, batch, estimate.manager, estimate.skills), optimizer, steps.num_steps
+        )
+        baselines.fit(batch, estimate.returns)
+        check_finite(iteration, parameters=nn.utils.parameters_to_vector(policy.parameters()))
+        end = time.perf_counter()
+
+        metrics = {
+            "iteration": iteration,
+            "env_steps": (iteration + 1) * steps.num_steps,
+            **steps.statistics(),
+            "objective": objective,
+            **{f"{kind}_explained_variance": value for kind, value in estimate.explained_variance.items()},
+            **statistics,
+        }
+        log.row(metrics, steps.timing(start, collected, end))
+        checkpoint.record(iteration, **parts)
+    envs.close()

@@ -1,0 +1,103 @@
+"""Policies against torch.distributions and against the one-hot formulas written out."""
+
+import math
+
+import pytest
+import torch
+
+from hippo.core.policies import (
+    GaussianPolicy,
+    Manager,
+    SkillLinear,
+    SkillPolicy,
+    gaussian_entropy,
+    gaussian_log_prob,
+    sample_categorical,
+)
+
+
+def generator(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def test_gaussian_log_prob_and_entropy_are_those_of_the_distribution():
+    mean, action = torch.randn(2, 5, 3, generator=generator(), dtype=torch.float64)
+    log_std = torch.tensor([0.3, -1.0, 0.0], dtype=torch.float64)
+    reference = torch.distributions.Independent(torch.distributions.Normal(mean, log_std.exp()), 1)
+    torch.testing.assert_close(gaussian_log_prob(mean, log_std, action), reference.log_prob(action))
+    torch.testing.assert_close(gaussian_entropy(log_std), reference.entropy()[0])
+    # At the mean of a standard normal in two dimensions: -ln(2 pi).
+    zero = torch.zeros(2, dtype=torch.float64)
+    assert float(gaussian_log_prob(zero, zero, zero)) == pytest.approx(-math.log(2 * math.pi), abs=1e-12)
+
+
+@pytest.mark.parametrize("integration", ["bilinear", "concatenate"])
+def test_the_skill_layer_is_a_linear_layer_over_the_one_hot_input(integration):
+    layer = SkillLinear(3, 4, 5, integration, generator()).double()
+    x = torch.randn(7, 3, generator=generator(1), dtype=torch.float64)
+    skill = torch.tensor([0, 0, 1, 2, 2, 2, 3])
+    z = torch.nn.functional.one_hot(skill, 4).double()
+    product = (x.unsqueeze(2) * z.unsqueeze(1)).flatten(1)  # entry i Z + j is x_i z_j
+    inputs = torch.cat([x, z, product] if integration == "bilinear" else [x, z], 1)
+    expected = inputs @ layer.weight.T + layer.bias
+    torch.testing.assert_close(layer(x, skill), expected)
+    torch.testing.assert_close(layer.grouped(x, [2, 1, 3, 1]), expected)
+    torch.testing.assert_close(layer.all_skills(x)[torch.arange(7), skill], expected)
+    if integration == "bilinear":
+        wrong = torch.cat([x, z, (z.unsqueeze(2) * x.unsqueeze(1)).flatten(1)], 1)  # skill-major flattening
+        assert not torch.allclose(wrong @ layer.weight.T + layer.bias, expected)
+
+
+def test_an_unknown_integration_is_named():
+    with pytest.raises(ValueError, match="integration=sum"):
+        SkillLinear(3, 4, 5, "sum", generator())
+
+
+@pytest.mark.parametrize("per_skill", [False, True])
+def test_the_three_log_probabilities_of_the_skill_policy_agree(per_skill):
+    policy = SkillPolicy(3, 4, 2, [8, 6], generator(), log_std_per_skill=per_skill).double()
+    with torch.no_grad():
+        policy.log_std_parameter.normal_(generator=generator(2))
+    obs, action = torch.randn(9, 3, dtype=torch.float64), torch.randn(9, 2, dtype=torch.float64)
+    skill = torch.tensor([0, 0, 0, 1, 1, 2, 3, 3, 3])
+    everything = policy.log_prob_all(obs, action)
+    torch.testing.assert_close(policy.log_prob(obs, skill, action), everything[torch.arange(9), skill])
+    mean = policy.act(obs, skill, torch.zeros(9, 2, dtype=torch.float64))
+    torch.testing.assert_close(
+        gaussian_log_prob(mean, policy.log_std()[skill], action), everything[torch.arange(9), skill]
+    )
+
+
+def test_networks_have_the_papers_sizes():
+    # Facts about the authors' networks: Ant, random p: skills 17 680 and manager 2 822 parameters; flat 29 264.
+    count = lambda net: sum(p.numel() for p in net.parameters())  # noqa: E731
+    assert count(SkillPolicy(28, 6, 8, [64, 64], generator())) == 17_680
+    assert count(Manager(48, 6, [32, 32], generator())) == 2_822
+    assert count(GaussianPolicy(47, 8, [256, 64], generator())) == 29_264
+    # Snake, ego observation, random p: skills 10 696, manager 2 342, flat 25 160.
+    assert count(SkillPolicy(13, 6, 4, [64, 64], generator())) == 10_696
+    assert count(Manager(33, 6, [32, 32], generator())) == 2_342
+    assert count(GaussianPolicy(32, 4, [256, 64], generator())) == 25_160
+
+
+def test_initial_weights_are_glorot_uniform_with_zero_bias_and_unit_std():
+    policy = GaussianPolicy(20, 3, [256, 64], generator())
+    first = policy.mean[0]
+    bound = math.sqrt(6 / (20 + 256))
+    assert 0.98 * bound < first.weight.abs().max() <= bound
+    assert not first.bias.any()
+    assert policy.log_std.exp().tolist() == [1.0, 1.0, 1.0]
+
+
+def test_the_standard_deviation_has_a_floor():
+    policy = GaussianPolicy(2, 1, [4], generator())
+    with torch.no_grad():
+        policy.log_std_parameter.fill_(-50.0)
+    assert float(policy.log_std.exp()) == pytest.approx(1e-4)
+
+
+def test_inverse_cdf_sampling_worked_by_hand():
+    # Probabilities 0.2, 0.3, 0.5: u in [0, 0.2) -> 0, [0.2, 0.5) -> 1, [0.5, 1) -> 2.
+    logits = torch.tensor([0.2, 0.3, 0.5]).log().expand(6, 3)
+    uniform = torch.tensor([0.0, 0.19, 0.21, 0.49, 0.51, 0.9999999])
+    assert sample_categorical(logits, uniform).tolist() == [0, 0, 1, 1, 2, 2]

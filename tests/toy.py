@@ -1,0 +1,66 @@
+"""Small vector environments with the interface of hippo.envs, whose right answers are known."""
+
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from hippo.core.checkpoint import Checkpoint
+from hippo.core.log import RunLog
+
+
+class TargetEnv(gym.vector.VectorEnv):
+    """The reward is 1 - |a - o|^2 for an observation o drawn anew at every step: the best action is the observation.
+
+    `death_rate` ends episodes at random, for learners that must cope with early ends.
+    """
+
+    metadata = {"autoreset_mode": gym.vector.AutoresetMode.SAME_STEP}  # noqa: RUF012
+
+    def __init__(self, num_envs: int, seed: int, horizon: int = 20, size: int = 2, death_rate: float = 0.0) -> None:
+        self.num_envs, self.horizon, self.death_rate = num_envs, horizon, death_rate
+        self.robot_size = size
+        self.single_observation_space = gym.spaces.Box(-1, 1, (size,), np.float32)
+        self.single_action_space = gym.spaces.Box(-1, 1, (size,), np.float32)
+        self.rng = np.random.default_rng(seed)
+
+    def _draw(self) -> np.ndarray:
+        return self.rng.uniform(-1, 1, (self.num_envs, self.robot_size)).astype(np.float32)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[np.ndarray, dict]:
+        if seed is not None:
+            self.rng = np.random.default_rng(seed)
+        self.clock = np.zeros(self.num_envs, int)
+        self.obs = self._draw()
+        return self.obs.copy(), {}
+
+    def step(self, actions: np.ndarray) -> tuple:
+        reward = 1 - ((actions - self.obs) ** 2).sum(1).astype(np.float64)
+        self.clock += 1
+        terminated = self.rng.random(self.num_envs) < self.death_rate
+        truncated = (self.clock == self.horizon) & ~terminated
+        done = terminated | truncated
+        self.obs = self._draw()
+        info: dict[str, Any] = {"diverged": np.zeros(self.num_envs, bool)}
+        if done.any():
+            info |= {"final_obs": self.obs.copy(), "_final_obs": done}
+            self.obs[done] = self._draw()[done]
+            self.clock[done] = 0
+        return self.obs.copy(), reward, terminated, truncated, info
+
+
+def run(train: Any, config: Any, folder: Path, seed: int = 0, **env_options: Any) -> None:
+    """Train in `folder` on TargetEnv, resuming from what lies there."""
+
+    def make_envs(num_envs: int, purpose: str) -> TargetEnv:
+        return TargetEnv(num_envs, seed, horizon=config.horizon, **env_options)
+
+    train(config, make_envs, RunLog(folder), seed, Checkpoint(folder))
+
+
+def progress(folder: Path) -> dict[str, np.ndarray]:
+    """The columns of progress.csv."""
+    lines = [line.split(",") for line in (folder / "progress.csv").read_text().splitlines()]
+    table = np.array(lines[1:], dtype=float)
+    return dict(zip(lines[0], table.T, strict=True))
