@@ -168,5 +168,8 @@ class SkillPolicy(nn.Module):
 
     def log_prob_all(self, obs: Tensor, action: Tensor) -> Tensor:
         """log pi_l(a|s, z) under every skill: (B, D), (B, A) -> (B, Z)."""
-        mean = self.rest(self.first.all_skills(obs))  # (B, Z, A)
-        return gaussian_log_prob(mean, self.log_std(), action.unsqueeze(1))
+        return gaussian_log_prob(self.means(obs), self.log_std(), action.unsqueeze(1))
+
+    def means(self, obs: Tensor) -> Tensor:
+        """Mean action of every skill: (B, D) -> (B, Z, A)."""
+        return self.rest(self.first.all_skills(obs))
