@@ -1,0 +1,295 @@
+"""One run's configuration: composed by Hydra from conf/ and overrides, validated, and named by its content."""
+
+import contextlib
+import dataclasses
+import difflib
+import functools
+import hashlib
+import importlib
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import yaml
+from hydra import compose, initialize_config_dir
+from hydra.core.config_store import ConfigStore
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
+from hydra.errors import HydraException
+from omegaconf import MISSING, DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from hippo.core.settings import ConfigError
+from hippo.envs import ENVIRONMENTS
+from hippo.envs.registration import Options, check_option
+
+CONF = Path(__file__).parent / "conf"
+# name -> (module, config class); a module holds the config, REVISION and train
+ALGORITHMS = {
+    "hippo": ("hippo.hippo", "HippoConfig"),
+    "ppo": ("baselines.ppo", "PPOConfig"),
+    "hier_vpg": ("baselines.hier_vpg", "HierVPGConfig"),
+}
+BUDGET_FIELDS = ("iterations", "batch_size", "horizon")
+# Filled in from the run level, or descriptions that no override should touch.
+NOT_OVERRIDDEN = {"budget", "seeds", "scale", "env.name", "env.label", "env.seconds_per_step"} | {
+    f"algo.{name}" for name in BUDGET_FIELDS
+}
+WANDB_MODES = ("disabled", "offline", "online")
+
+
+@dataclass
+class EnvConfig(Options):
+    """An environment and its options."""
+
+    name: str = MISSING
+    label: str = MISSING
+    horizon: int = MISSING
+    seconds_per_step: float = MISSING
+
+
+@dataclass
+class Budget:
+    """What one environment gets at one scale."""
+
+    iterations: int = MISSING
+    batch_size: int = MISSING
+    horizon: int = MISSING
+    physics: str = MISSING
+
+
+@dataclass
+class WandbConfig:
+    """The mirror to Weights & Biases."""
+
+    mode: str = "disabled"
+
+
+@dataclass
+class RunSchema:
+    """The root of a composed configuration."""
+
+    env: EnvConfig = MISSING
+    algo: Any = MISSING
+    scale: str = MISSING
+    seed: int = MISSING
+    seeds: int = MISSING
+    iterations: int = MISSING
+    batch_size: int = MISSING
+    runs_dir: str = MISSING
+    budget: dict[str, Budget] = field(default_factory=dict)
+    wandb: WandbConfig = field(default_factory=WandbConfig)
+
+
+@dataclass(frozen=True)
+class Run:
+    """One validated run."""
+
+    algo: str
+    config: Any  # the algorithm's dataclass
+    env: str
+    options: dict[str, Any]  # environment options that are not at their default
+    scale: str
+    seed: int
+    runs_dir: Path
+    wandb_mode: str
+    seconds_per_step: float
+
+    @functools.cached_property
+    def identity(self) -> dict[str, Any]:
+        """Everything that decides the numbers of this run; settings at their default are left out."""
+        settings = {
+            f.name: getattr(self.config, f.name)
+            for f in dataclasses.fields(self.config)
+            if f.name not in BUDGET_FIELDS and getattr(self.config, f.name) != default_of(f)
+        }
+        return {
+            "algo": self.algo,
+            "algo_revision": algorithm(self.algo).REVISION,
+            "settings": settings,
+            "env": self.env,
+            "env_revision": ENVIRONMENTS[self.env].revision,
+            "options": self.options,
+            **{name: getattr(self.config, name) for name in BUDGET_FIELDS},
+            "seed": self.seed,
+            "mujoco": version("mujoco"),
+        }
+
+    @functools.cached_property
+    def run_id(self) -> str:
+        """The run's name: a hash of its identity."""
+        return hashlib.sha256(json.dumps(self.identity, sort_keys=True).encode()).hexdigest()[:12]
+
+    @property
+    def folder(self) -> Path:
+        """Where the run lives; not part of its identity."""
+        return self.runs_dir / self.run_id
+
+    @property
+    def env_steps(self) -> int:
+        """Environment steps that the whole run takes."""
+        return self.config.iterations * self.config.num_envs * self.config.horizon
+
+    @property
+    def estimated_seconds(self) -> float:
+        """A rough cost on one core."""
+        return self.env_steps * self.seconds_per_step
+
+    def to_yaml(self) -> str:
+        """The run as text; `Run.from_yaml` gives it back."""
+        plain = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name != "runs_dir"}
+        return yaml.safe_dump(plain | {"config": dataclasses.asdict(self.config)}, sort_keys=False)
+
+    @staticmethod
+    def from_yaml(text: str, runs_dir: Path) -> "Run":
+        """Rebuild a run from what `to_yaml` wrote."""
+        plain = yaml.safe_load(text)
+        return Run(**plain | {"config": config_class(plain["algo"])(**plain["config"]), "runs_dir": runs_dir})
+
+
+def default_of(f: dataclasses.Field) -> Any:
+    """A dataclass field's default value, MISSING where it has none."""
+    return f.default_factory() if f.default_factory is not dataclasses.MISSING else f.default
+
+
+def algorithm(name: str) -> Any:
+    """The module of an algorithm, imported when it is needed."""
+    return importlib.import_module(ALGORITHMS[name][0])
+
+
+def config_class(name: str) -> Any:
+    """The config dataclass of an algorithm."""
+    return getattr(algorithm(name), ALGORITHMS[name][1])
+
+
+def choices(group: str) -> list[str]:
+    """The files of one group of conf/, e.g. the scales."""
+    return sorted(path.stem for path in (CONF / group).glob("*.yaml"))
+
+
+def nearest(value: str, valid: Sequence[str]) -> str:
+    """A hint at the valid choices, the closest one first if there is one; of many choices only the closest five."""
+    close = difflib.get_close_matches(value, valid, n=5, cutoff=0.6 if len(valid) <= 12 else 0.3)
+    suggestion = f"did you mean {close[0]}? " if close else ""
+    return f"{suggestion}valid: {', '.join(valid if len(valid) <= 12 else [*close, '...'])}"
+
+
+def check_choice(key: str, value: str, valid: Sequence[str]) -> str:
+    """`value`, or a ConfigError that names the valid ones."""
+    if value not in valid:
+        raise ConfigError(key, value, nearest(value, valid))
+    return value
+
+
+@functools.cache
+def _register() -> None:
+    store = ConfigStore.instance()
+    store.store(name="run_schema", node=RunSchema)
+    store.store(group="env", name="env_schema", node=EnvConfig)
+    for name in ALGORITHMS:
+        store.store(group="algo", name=f"{name}_schema", node=config_class(name))
+
+
+@functools.cache
+def _base(env: str, algo: str, scale: str) -> DictConfig:
+    """The composed configuration before any override; Hydra is asked once per combination."""
+    _register()
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        return compose("config", overrides=[f"env={env}", f"algo={algo}", f"scale={scale}"])
+
+
+def compose_run(overrides: Sequence[str]) -> Run:
+    """The run described by `overrides` in Hydra's grammar, e.g. ["env=ant_gather", "algo.period_min=5"].
+
+    Raises:
+        ConfigError: an unknown group choice or key, a value of the wrong type or out of range.
+    """
+    groups = {"env": "block_hopper", "algo": "hippo", "scale": "paper"}
+    settings = []
+    for override in _parse(overrides):
+        key = override.key_or_group
+        if key in groups:
+            valid = list(ALGORITHMS) if key == "algo" else choices(key)
+            groups[key] = check_choice(key, str(override.value()), valid)
+        else:
+            settings.append(override)
+    config = _base(**groups).copy()
+    for override in settings:
+        _apply(config, override)
+    return _validated(config, groups["algo"])
+
+
+def _parse(overrides: Sequence[str]) -> list[Override]:
+    parsed = []
+    for text in overrides:
+        with _as_config_error(*([*text.split("=", 1), ""][:2])):
+            (override,) = OverridesParser.create().parse_overrides([text])
+        if override.is_sweep_override() or override.is_add() or override.is_delete():
+            raise ConfigError(text, "", "plain key=value overrides only; sweeps are experiments.sweep's")
+        parsed.append(override)
+    return parsed
+
+
+def _apply(config: DictConfig, override: Override) -> None:
+    key, value = override.key_or_group, override.value()
+    known = sorted(_keys(config))
+    if key not in known:
+        raise ConfigError(key, value, f"no such key; {nearest(key, known)}")
+    with _as_config_error(key, value):
+        OmegaConf.update(config, key, value)
+
+
+def _keys(node: DictConfig, prefix: str = "") -> Iterator[str]:
+    for name in map(str, node):
+        key, child = f"{prefix}{name}", node._get_node(name)
+        if isinstance(child, DictConfig) and name != "budget":
+            yield from _keys(child, f"{key}.")
+        elif key not in NOT_OVERRIDDEN:
+            yield key
+
+
+@contextlib.contextmanager
+def _as_config_error(key: str, value: Any) -> Iterator[None]:
+    """Turn what Hydra and OmegaConf raise into one line about the key and the value."""
+    try:
+        yield
+    except (HydraException, OmegaConfBaseException) as error:
+        raise ConfigError(key, value, str(error).splitlines()[0]) from error
+
+
+def _validated(config: DictConfig, algo: str) -> Run:
+    with _as_config_error("config", algo):
+        plain = OmegaConf.to_container(config, resolve=True)
+    assert isinstance(plain, dict)
+    env: dict[str, Any] = plain["env"]
+    try:
+        settings = config_class(algo)(**plain["algo"])
+    except ConfigError as error:
+        level = {"iterations": "", "batch_size": "", "horizon": "env."}.get(error.key, "algo.")
+        key = f"{level}{error.key}"
+        raise ConfigError(key, error.value, error.valid) from error
+    options = {}
+    for f in dataclasses.fields(Options):
+        if env[f.name] != f.default:
+            try:
+                check_option(env["name"], f.name, env[f.name])
+            except ValueError as error:
+                raise ConfigError(f"env.{f.name}", env[f.name], str(error).split(": ", 1)[1]) from error
+            options[f.name] = env[f.name]
+    check_choice("wandb.mode", plain["wandb"]["mode"], WANDB_MODES)
+    if not 0 <= plain["seed"] < 2**32:
+        raise ConfigError("seed", plain["seed"], "must be at least 0 and below 2**32")
+    return Run(
+        algo,
+        settings,
+        env["name"],
+        options,
+        plain["scale"],
+        plain["seed"],
+        Path(plain["runs_dir"]),
+        plain["wandb"]["mode"],
+        env["seconds_per_step"],
+    )

@@ -1,0 +1,108 @@
+"""Where runs are trained: a pool of worker processes on this machine."""
+
+import multiprocessing
+import os
+import signal
+import sys
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from multiprocessing.connection import Connection, wait
+from pathlib import Path
+from typing import Any
+
+from experiments.config import Run
+
+POLL_SECONDS = 1.0
+
+
+@dataclass
+class Worker:
+    """One process that trains runs one after another, so that importing torch is paid for once."""
+
+    process: Any
+    connection: Connection
+    run: Run | None = None
+
+
+def _work(connection: Connection) -> None:
+    """Body of a worker process: train what arrives, answer with its final state, until the pipe closes."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to the parent, which sends SIGTERM
+    from experiments.train import execute
+
+    while True:
+        try:
+            text, runs_dir = connection.recv()
+        except EOFError:
+            return
+        run = Run.from_yaml(text, Path(runs_dir))
+        run.folder.mkdir(parents=True, exist_ok=True)
+        with (run.folder / "train.log").open("a") as log:
+            os.dup2(log.fileno(), 1)
+            os.dup2(log.fileno(), 2)
+        connection.send(execute(run))
+
+
+def run_locally(runs: Sequence[Run], workers: int, on_change: Callable[[dict[str, Run], int], None]) -> dict[str, str]:
+    """Train `runs` in a pool, longest first.
+
+    A worker that dies fails its own run only, and is replaced. On Ctrl-C every worker abandons its iteration and the
+    runs stay resumable.
+
+    Args:
+        on_change: called about once a second with the runs in progress, by id, and the number of those that ended.
+
+    Returns:
+        Run id -> final state.
+    """
+    context = multiprocessing.get_context("spawn")
+    queue = deque(sorted(runs, key=lambda run: -run.estimated_seconds))
+    states: dict[str, str] = {}
+    pool: list[Worker] = []
+
+    def start() -> Worker:
+        ours, theirs = context.Pipe()
+        process = context.Process(target=_work, args=(theirs,), daemon=True)
+        process.start()
+        theirs.close()
+        return Worker(process, ours)
+
+    def give(worker: Worker) -> None:
+        if queue:
+            worker.run = queue.popleft()
+            worker.connection.send((worker.run.to_yaml(), str(worker.run.runs_dir)))
+
+    try:
+        for _ in range(min(workers, len(queue))):
+            pool.append(start())
+            give(pool[-1])
+        while busy := [worker for worker in pool if worker.run is not None]:
+            ready = wait([worker.connection for worker in busy], timeout=POLL_SECONDS)
+            for worker in busy:
+                if worker.connection not in ready:
+                    continue
+                assert worker.run is not None
+                run, worker.run = worker.run, None
+                try:
+                    states[run.run_id] = worker.connection.recv()
+                except (EOFError, ConnectionResetError):
+                    worker.process.join()
+                    states[run.run_id] = "lost"
+                    pool.remove(worker)
+                    worker = start()
+                    pool.append(worker)
+                give(worker)
+            on_change({w.run.run_id: w.run for w in pool if w.run is not None}, len(states))
+    finally:
+        for worker in pool:
+            worker.connection.close()
+            if worker.run is not None:
+                worker.process.terminate()
+        deadline = time.monotonic() + 30
+        for worker in pool:
+            worker.process.join(max(0.0, deadline - time.monotonic()))
+            if worker.process.is_alive():
+                print(f"worker {worker.process.pid} did not stop; killing it", file=sys.stderr)
+                worker.process.kill()
+    return states

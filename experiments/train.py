@@ -1,0 +1,258 @@
+"""One run, from its configuration to `status.json: finished`; resumes by itself and never trains twice.
+
+    python -m experiments.train algo=hippo env=ant_gather seed=3 algo.period_min=5
+
+A run lives in runs/<run_id>/: config.yaml (what it is), manifest.json (where it came from), status.json (how it is
+doing), progress.csv and timing.csv (what it measured), checkpoint.pt and checkpoint.prev.pt.
+"""
+
+import contextlib
+import json
+import os
+import platform
+import shlex
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Iterator
+from hashlib import sha256
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import psutil
+import torch
+from filelock import FileLock, Timeout
+
+from experiments.config import Run, algorithm, compose_run
+from hippo.core import seeding
+from hippo.core.checkpoint import Checkpoint, CheckpointError
+from hippo.core.log import Diverged, Row, RunLog
+from hippo.core.settings import ConfigError
+from hippo.envs import make
+
+HEARTBEAT_SECONDS = 5.0
+EXIT_FAILED, EXIT_BAD_INPUT, EXIT_DIVERGED, EXIT_REQUEUE = 1, 2, 3, 75  # 75 is sysexits' EX_TEMPFAIL
+EXIT_CODES = {"finished": 0, "running": 0, "failed": EXIT_FAILED, "diverged": EXIT_DIVERGED, "preempted": EXIT_REQUEUE}
+ROOT = Path(__file__).parent.parent
+
+
+class Preempted(BaseException):
+    """SIGTERM or SIGUSR1 arrived: the iteration is abandoned; the last checkpoint is complete."""
+
+
+class Status:
+    """status.json of one run, rewritten atomically at every change and every few seconds."""
+
+    def __init__(self, run: Run) -> None:
+        self.path = run.folder / "status.json"
+        self.lock = threading.Lock()
+        self.content: dict[str, Any] = {
+            "state": "running",
+            "iteration": -1,
+            "iterations": run.config.iterations,
+            "env_steps": 0,
+            "steps_per_second": None,
+            "host": socket.gethostname(),
+            "pid": os.getpid(),
+            "started": time.time(),
+            "message": "",
+        }
+
+    def update(self, **changes: Any) -> None:
+        """Change some entries and write the file."""
+        with self.lock:
+            self.content |= {**changes, "heartbeat": time.time()}
+            write_atomically(self.path, json.dumps(self.content, indent=1))
+
+    @contextlib.contextmanager
+    def heartbeat(self) -> Iterator[None]:
+        """Keep the file fresh from a thread, and end this process if the one that started it is gone."""
+        stop, parent = threading.Event(), os.getppid()
+
+        def beat() -> None:
+            while not stop.wait(HEARTBEAT_SECONDS):
+                self.update()
+                if os.getppid() != parent:
+                    os.kill(os.getpid(), signal.SIGTERM)
+
+        thread = threading.Thread(target=beat, daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            stop.set()
+            thread.join()
+
+
+def write_atomically(path: Path, text: str) -> None:
+    """Replace `path` so that a reader sees the old or the new text, never a part."""
+    temporary = path.with_name(path.name + ".tmp")
+    temporary.write_text(text)
+    temporary.replace(path)
+
+
+def read_status(folder: Path) -> dict[str, Any]:
+    """A run's status; state "missing" where it never started, "lost" where its heartbeat stopped."""
+    try:
+        status = json.loads((folder / "status.json").read_text())
+    except FileNotFoundError:
+        return {"state": "missing", "iteration": -1, "message": ""}
+    if status["state"] == "running" and time.time() - status["heartbeat"] > 6 * HEARTBEAT_SECONDS:
+        status["state"] = "lost"
+    return status
+
+
+def git(*arguments: str) -> str:
+    """Output of a git command in this repository, "" outside one."""
+    result = subprocess.run(["git", "-C", str(ROOT), *arguments], capture_output=True, text=True, check=False)
+    return result.stdout.strip()
+
+
+def manifest(run: Run) -> dict[str, Any]:
+    """Where a run comes from: code, versions, machine, command. Holds no host name, user or environment."""
+    lock = ROOT / "requirements.lock"
+    difference = git("diff", "HEAD")
+    cpu = next((x for x in Path("/proc/cpuinfo").read_text().split("\n") if x.startswith("model name")), "")
+    return {
+        "schema": 1,
+        "run_id": run.run_id,
+        "identity": run.identity,
+        "config": run.to_yaml(),
+        "command": shlex.join(["python", *sys.orig_argv[1:]]),
+        "git_commit": git("rev-parse", "HEAD"),
+        "git_difference": sha256(difference.encode()).hexdigest() if difference else None,
+        "lock": sha256(lock.read_bytes()).hexdigest() if lock.exists() else None,
+        "python": platform.python_version(),
+        "versions": {name: version(name) for name in ("torch", "mujoco", "gymnasium", "numpy", "scipy")},
+        "cpu": cpu.partition(":")[2].strip() or platform.processor(),
+        "cpu_capability": torch.backends.cpu.get_cpu_capability(),
+        "seed": {"root": run.seed, "streams": "SHA-256 of the purpose, then indices; see hippo/core/seeding.py"},
+    }
+
+
+def execute(run: Run) -> str:
+    """Train `run` to its end; returns its state: finished, running (elsewhere), diverged, failed or preempted."""
+    if read_status(run.folder)["state"] == "finished":
+        print(f"{run.run_id} is finished: {run.folder}")
+        return "finished"
+    run.folder.mkdir(parents=True, exist_ok=True)
+    try:
+        with FileLock(run.folder / ".lock", timeout=0):
+            return _execute_locked(run)
+    except Timeout:
+        status = read_status(run.folder)
+        print(f"{run.run_id} is already running (host {status.get('host')}, pid {status.get('pid')})")
+        return "running"
+
+
+def _execute_locked(run: Run) -> str:
+    if read_status(run.folder)["state"] == "finished":  # by whoever held the lock before
+        return "finished"
+    _announce_resumption(run)
+    write_atomically(run.folder / "config.yaml", run.to_yaml())
+    write_atomically(run.folder / "manifest.json", json.dumps(manifest(run), indent=1))
+    status = Status(run)
+    status.update()
+    with _preemption(), status.heartbeat():
+        try:
+            train(run, status)
+            status.update(state="finished", message="")
+        except Diverged as error:
+            status.update(state="diverged", message=str(error))
+            print(f"diverged: {error}", file=sys.stderr)
+        except (Preempted, KeyboardInterrupt) as error:
+            status.update(state="preempted", message=f"stopped by {error or 'Ctrl-C'}; start it again to continue")
+        except Exception as error:
+            status.update(state="failed", message=f"{type(error).__name__}: {error}".splitlines()[0])
+            traceback.print_exc()
+    return status.content["state"]
+
+
+def _announce_resumption(run: Run) -> None:
+    path = run.folder / "manifest.json"
+    if not (run.folder / "checkpoint.pt").exists() or not path.exists():
+        return
+    before, now = json.loads(path.read_text())["git_commit"], git("rev-parse", "HEAD")
+    where = "" if before == now else f" under commit {now[:10] or 'unknown'}, begun under {before[:10] or 'unknown'}"
+    print(f"resuming {run.run_id}{where}", flush=True)
+
+
+@contextlib.contextmanager
+def _preemption() -> Iterator[None]:
+    """Turn SIGTERM and SIGUSR1 into Preempted while the block runs."""
+
+    def stop(number: int, frame: object) -> None:
+        raise Preempted(signal.Signals(number).name)
+
+    before = {number: signal.signal(number, stop) for number in (signal.SIGTERM, signal.SIGUSR1)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def train(run: Run, status: Status) -> None:
+    """Hand the run to its algorithm."""
+    torch.set_num_threads(1)
+    torch.use_deterministic_algorithms(True)
+    started, first = time.monotonic(), None
+
+    def make_envs(num_envs: int, purpose: str) -> Any:
+        seed = seeding.integer(run.seed, "environments", *purpose.encode())
+        return make(run.env, num_envs, seed, horizon=run.config.horizon, **run.options)
+
+    def on_row(metrics: Row, timing: Row) -> None:
+        nonlocal first
+        done = int(metrics["iteration"]) + 1
+        first = done - 1 if first is None else first
+        eta = (time.monotonic() - started) / (done - first) * (run.config.iterations - done)
+        speed = timing["steps_per_second"]
+        print(
+            f"{run.run_id} {run.algo} {run.env} seed {run.seed}  iteration {done}/{run.config.iterations}  "
+            f"return {metrics['return_mean']:.3f}  {speed:,.0f} steps/s  ETA {clock(eta)}",
+            flush=True,
+        )
+        status.update(iteration=done - 1, env_steps=metrics["env_steps"], steps_per_second=speed)
+
+    log, checkpoint = RunLog(run.folder, on_row), Checkpoint(run.folder)
+    algorithm(run.algo).train(run.config, make_envs, log, run.seed, checkpoint)
+
+
+def clock(seconds: float) -> str:
+    """Seconds as h:mm:ss."""
+    whole = round(seconds)
+    return f"{whole // 3600}:{whole % 3600 // 60:02d}:{whole % 60:02d}"
+
+
+def bad_input(error: Exception) -> int:
+    """One line about what was wrong with the input."""
+    print(f"error: {error}", file=sys.stderr)
+    return EXIT_BAD_INPUT
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Train one run; the exit code says how it ended."""
+    arguments = sys.argv[1:] if arguments is None else arguments
+    if {"-h", "--help"} & set(arguments):
+        print(__doc__)
+        return 0
+    try:
+        run = compose_run(arguments)
+    except ConfigError as error:
+        return bad_input(error)
+    psutil.Process().nice(5)  # a training never makes the machine it runs on unusable
+    try:
+        return EXIT_CODES[execute(run)]
+    except CheckpointError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return EXIT_FAILED
+
+
+if __name__ == "__main__":
+    sys.exit(main())

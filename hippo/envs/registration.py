@@ -1,0 +1,95 @@
+"""The environments by name: robot, task, horizon, and which options each of them has."""
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any
+
+from hippo.envs.blocks import Blocks
+from hippo.envs.gather import Gather
+from hippo.envs.perturb import PERTURBATIONS, STRENGTHS
+from hippo.envs.robots import ROBOTS
+from hippo.envs.vector import RobotTaskEnv
+
+
+@dataclass
+class Options:
+    """Every option of an environment, at its default; the paper's choice unless its comment says otherwise."""
+
+    physics: str = "paper"  # "fast" (ours): the same robot with a cheaper integrator
+    observation: str = "paper"  # Snake: "ego" leaves out absolute x, y and the centre of mass
+    perturbation: str | None = None  # one quantity of the dynamics changed, for Table 1
+    strength: str = "original"  # what a perturbation changes: the authors' elements, or "all" (ours)
+    velocity_penalty: bool = False  # Gather: penalise the centre of mass's speed, for Fig. 6
+    grid: str = "original"  # Gather: "symmetric" (ours) also places objects at +6 m
+    walls: bool = False  # Snake Gather (ours): the arena's walls hold the Snake; they always hold the Ant
+    terminate_on_fall: bool = False  # Block: rllab's conditions; the paper names none
+
+
+@dataclass(frozen=True)
+class Environment:
+    """One named environment."""
+
+    robot: str
+    task: Any
+    horizon: int  # steps
+    revision: int  # bumped when golden trajectories change
+    options: dict[str, tuple[Any, ...]]  # option -> valid values
+
+
+_SHARED = {"perturbation": (None, *PERTURBATIONS), "strength": STRENGTHS}
+_SWITCH = (False, True)
+_GATHER = _SHARED | {"velocity_penalty": _SWITCH, "grid": ("original", "symmetric"), "physics": ("paper", "fast")}
+_BLOCK = _SHARED | {"terminate_on_fall": _SWITCH, "physics": ("paper",), "observation": ("paper",)}
+
+ENVIRONMENTS = {
+    "ant_gather": Environment("ant", Gather, 5000, 1, _GATHER | {"observation": ("paper",)}),
+    "snake_gather": Environment(
+        "snake", Gather, 8000, 1, _GATHER | {"observation": ("paper", "ego"), "walls": _SWITCH}
+    ),
+    "block_hopper": Environment("hopper", Blocks, 1000, 1, _BLOCK),
+    "block_half_cheetah": Environment("half_cheetah", Blocks, 1000, 1, _BLOCK),
+}
+
+
+def make(
+    name: str, num_envs: int, seed: int, num_threads: int = 1, horizon: int | None = None, **options: Any
+) -> RobotTaskEnv:
+    """Build a vector environment.
+
+    Args:
+        name: a key of ENVIRONMENTS. num_envs: simulations. seed: environment i draws from `seed + i`.
+        num_threads: that MuJoCo steps on; results do not depend on it.
+        horizon: steps to truncation instead of the environment's own. options: fields of Options.
+
+    Raises:
+        ValueError: a name, option or value that does not exist; the message names it and the valid ones.
+    """
+    if name not in ENVIRONMENTS:
+        raise ValueError(f"env={name}: must be one of {', '.join(ENVIRONMENTS)}")
+    if num_envs < 1:
+        raise ValueError(f"num_envs={num_envs}: must be at least 1")
+    environment = ENVIRONMENTS[name]
+    horizon = environment.horizon if horizon is None else horizon
+    if horizon < 1:
+        raise ValueError(f"horizon={horizon}: must be at least 1")
+    for key, value in options.items():
+        check_option(name, key, value)
+    return RobotTaskEnv(
+        ROBOTS[environment.robot],
+        environment.task,
+        dataclasses.replace(Options(), **options),
+        num_envs,
+        seed,
+        horizon,
+        environment.revision,
+        num_threads,
+    )
+
+
+def check_option(name: str, key: str, value: Any) -> None:
+    """Raise ValueError unless `key` is an option of environment `name` and `value` one of its values."""
+    valid = ENVIRONMENTS[name].options
+    if key not in valid:
+        raise ValueError(f"{key}={value}: {name} has no such option; its options are {', '.join(valid)}")
+    if value not in valid[key] or isinstance(value, bool) != isinstance(valid[key][0], bool):
+        raise ValueError(f"{key}={value}: {name} takes one of {', '.join(map(str, valid[key]))}")

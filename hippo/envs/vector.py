@@ -1,0 +1,205 @@
+"""RobotTaskEnv: N copies of one robot on one task behind Gymnasium's vector interface, stepped as one batch."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from hippo.envs.perturb import perturb
+from hippo.envs.physics import BatchPhysics
+from hippo.envs.robots import Robot
+
+POSE_NOISE, VELOCITY_NOISE = 0.01, 0.1  # std of the initial qpos and qvel around the model's (rllab)
+RNG_WORDS = 6  # uint64 words that hold one PCG64 generator
+
+
+class RobotTaskEnv(gym.vector.VectorEnv):
+    """A vector environment with same-step autoreset.
+
+    When an episode ends in a step, the observation returned is the next episode's first, and the last one of the ended
+    episode is in `info["final_obs"]` (rows where `info["_final_obs"]`). `terminated` is the task's end, `truncated` the
+    horizon or a diverged simulation (`info["diverged"]`: reward 0, `final_obs` its last finite observation). The
+    reward's terms are in `info` under their names.
+
+    Environment i draws from its own generator, seeded with `seed + i`, so it does not depend on its neighbours.
+    """
+
+    metadata = {"render_modes": [], "autoreset_mode": gym.vector.AutoresetMode.SAME_STEP}  # noqa: RUF012
+
+    def __init__(
+        self,
+        robot: Robot,
+        task_class: Any,
+        options: Any,
+        num_envs: int,
+        seed: int,
+        horizon: int,
+        revision: int,
+        num_threads: int = 1,
+    ) -> None:
+        self.num_envs, self.horizon, self.revision, self.options = num_envs, horizon, revision, options
+        self.robot, self.task = robot, task_class(robot, options, num_envs)
+        spec = robot.spec(options.physics)
+        self.task.build(spec)
+        if options.perturbation is not None:
+            perturb(spec, robot.name, options.perturbation, options.strength)
+        model = spec.compile()
+        self.physics = BatchPhysics(model, num_envs, robot.timing(options.physics).frame_skip, num_threads)
+        self.task.attach(self.physics)
+        self._com = self.physics.bind("subtree_com")[:, 1]
+
+        self.quantities = robot.observations[options.observation]
+        entries = [
+            (name, unit, -bound, bound)
+            for q in self.quantities
+            for name, unit, bound in zip(q.names, q.units, q.bound, strict=True)
+        ]
+        self.robot_size = len(entries)
+        entries += self.task.entries
+        self.observation_names = [name for name, *_ in entries]
+        self.observation_units = [unit for _, unit, *_ in entries]
+        self._low, self._high = (np.array([e[i] for e in entries], np.float32) for i in (2, 3))
+        self.single_observation_space = gym.spaces.Box(self._low, self._high, dtype=np.float32)
+        self.single_action_space = gym.spaces.Box(-1.0, 1.0, (model.nu,), np.float32)
+        self.observation_space = gym.vector.utils.batch_space(self.single_observation_space, num_envs)
+        self.action_space = gym.vector.utils.batch_space(self.single_action_space, num_envs)
+
+        self._control_low, self._control_high = model.actuator_ctrlrange.T.copy()
+        self._qpos = model.key_qpos[0].copy() if model.nkey else model.qpos0.copy()
+        self._clock = np.zeros(num_envs, np.int64)
+        self._obs = np.zeros((num_envs, len(entries)), np.float32)
+        self._layout_seed: int | None = None
+        self._started = False
+        self._seed(seed)
+
+    def _seed(self, seed: int | Sequence[int | None]) -> None:
+        seeds = [seed + i for i in range(self.num_envs)] if isinstance(seed, int | np.integer) else list(seed)
+        if len(seeds) != self.num_envs:
+            raise ValueError(f"seed={seed}: give one integer or {self.num_envs} of them")
+        rngs = getattr(self, "_rngs", [None] * self.num_envs)
+        self._rngs = [
+            old if s is None and old is not None else np.random.Generator(np.random.PCG64(s))
+            for s, old in zip(seeds, rngs, strict=True)
+        ]
+
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Start a new episode everywhere.
+
+        Args:
+            seed: restarts the generators; None goes on with them.
+            options: `layout_seed`, an integer that fixes object positions or wall heights of this and all later
+                episodes in every environment (the pose stays random), or None to make them random again.
+        """
+        self._check_open()
+        unknown = set(options or {}) - {"layout_seed"}
+        if unknown:
+            raise ValueError(f"reset option {sorted(unknown)[0]}: the only one is layout_seed")
+        if options is not None and "layout_seed" in options:
+            self._layout_seed = options["layout_seed"]
+        if seed is not None:
+            self._seed(seed)
+        self._started = True
+        self._new_episodes(np.arange(self.num_envs))
+        self._obs = self._observe()
+        return self._obs.copy(), {"diverged": np.zeros(self.num_envs, bool)}
+
+    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """One control step of every environment; actions (N, A) are clipped to [-1, 1] and mapped to the controls."""
+        self._check_open()
+        if not self._started:
+            raise gym.error.ResetNeeded("step() before reset(): call reset() first")
+        actions = np.asarray(actions, np.float64)
+        if actions.shape != self.action_space.shape:
+            raise ValueError(f"actions have shape {actions.shape}; expected {self.action_space.shape}")
+        if not np.isfinite(actions).all():
+            raise ValueError(f"actions hold {np.count_nonzero(~np.isfinite(actions))} non-finite numbers")
+        middle, half = (self._control_high + self._control_low) / 2, (self._control_high - self._control_low) / 2
+        self.physics.ctrl[:] = middle + half * np.clip(actions, -1.0, 1.0)
+        self.physics.step()
+        self._clock += 1
+
+        reward, terminated, info = self.task.step()
+        diverged = self.physics.diverged()
+        if diverged.any():
+            reward, terminated = np.where(diverged, 0.0, reward), terminated & ~diverged
+            info = {name: np.where(diverged, 0.0, term) for name, term in info.items()}
+        truncated = ((self._clock >= self.horizon) & ~terminated) | diverged
+        info["diverged"] = diverged
+
+        obs = self._observe()
+        done = terminated | truncated
+        if done.any():
+            obs[diverged] = self._obs[diverged]
+            info |= {
+                "final_obs": obs.copy(),
+                "_final_obs": done,
+                "final_info": {name: term.copy() for name, term in info.items()},
+                "_final_info": done,
+            }
+            self._new_episodes(np.flatnonzero(done))
+            obs[done] = self._observe()[done]
+        self._obs = obs
+        return obs.copy(), reward, terminated, truncated, info
+
+    def _new_episodes(self, ids: np.ndarray) -> None:
+        model = self.physics.model
+        qpos, qvel = np.empty((len(ids), model.nq)), np.empty((len(ids), model.nv))
+        for row, i in enumerate(ids):
+            qpos[row] = self._qpos + POSE_NOISE * self._rngs[i].standard_normal(model.nq)
+            qvel[row] = VELOCITY_NOISE * self._rngs[i].standard_normal(model.nv)
+        fixed = self._layout_seed
+        layouts = [self._rngs[i] if fixed is None else np.random.default_rng(fixed) for i in ids]
+        self.physics.reset(ids, qpos, qvel)
+        self.task.reset(ids, layouts)
+        self.physics.forward(ids)
+        self._clock[ids] = 0
+
+    def _observe(self) -> np.ndarray:
+        """(N, D) float32 observation of the current state, within its bounds."""
+        sources = {"qpos": self.physics.qpos, "qvel": self.physics.qvel, "com": self._com}
+        parts = [sources[q.source][:, q.index[0] : q.index[-1] + 1] for q in self.quantities]
+        obs = np.concatenate([*parts, self.task.observe()], 1).astype(np.float32)
+        return np.clip(obs, self._low, self._high, out=obs)
+
+    def get_state(self) -> dict[str, Any]:
+        """Everything a bit-identical continuation needs, as arrays and integers."""
+        rngs = np.zeros((self.num_envs, RNG_WORDS), np.uint64)
+        for i, rng in enumerate(self._rngs):
+            s: Any = rng.bit_generator.state
+            words = [s["state"]["state"], s["state"]["inc"]]
+            split = [w for value in words for w in (value >> 64, value & (2**64 - 1))]
+            rngs[i] = [*split, s["has_uint32"], s["uinteger"]]
+        return {
+            "physics": self.physics.get_state(),
+            "task": {name: array.copy() for name, array in self.task.state.items()},
+            "clock": self._clock.copy(),
+            "obs": self._obs.copy(),
+            "rngs": rngs,
+            "layout_seed": -1 if self._layout_seed is None else self._layout_seed,
+            "started": int(self._started),
+        }
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Continue from what `get_state` returned, here or in another process."""
+        self._check_open()
+        for name, array in self.task.state.items():
+            array[:] = state["task"][name]
+        self._clock[:], self._obs = state["clock"], np.array(state["obs"])
+        for rng, row in zip(self._rngs, np.asarray(state["rngs"]).tolist(), strict=True):
+            high, low, inc_high, inc_low, has_uint32, uinteger = row
+            rng.bit_generator.state = {
+                "bit_generator": "PCG64",
+                "state": {"state": high << 64 | low, "inc": inc_high << 64 | inc_low},
+                "has_uint32": has_uint32,
+                "uinteger": uinteger,
+            }
+        self._layout_seed = None if state["layout_seed"] < 0 else int(state["layout_seed"])
+        self._started = bool(state["started"])
+        self.physics.set_state(state["physics"])
+
+    def _check_open(self) -> None:
+        if self.closed:
+            raise gym.error.ClosedEnvironmentError("this environment is closed")
