@@ -1,0 +1,1 @@
+"""From finished runs to numbers: tidy frames and statistics; no torch, no MuJoCo."""

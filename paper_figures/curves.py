@@ -1,0 +1,136 @@
+"""Learning curves: a panel per environment, a line per method, every seed visible; shared by figures 3 to 9."""
+
+import argparse
+import hashlib
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+
+from analysis import stats
+from analysis.runs import MissingData, Results, load, scores
+from paper_figures import style
+
+HERE = Path(__file__).parent
+NOT_A_RESULT = {"smoke": "smoke"}  # scales whose pictures say nothing about the methods
+
+
+def unique(results: Results, key: str) -> dict[str, str]:
+    """Environments or variants of the plan, in its order: name -> label."""
+    return {run[key]: run[f"{key}_label"] for run in results.plan["runs"]}
+
+
+def draw_panel(axes: Axes, results: Results, env: str, unit: float) -> dict[str, int]:
+    """Draw all methods of one environment; returns the number of seeds behind each."""
+    variants, seeds_drawn = unique(results, "variant"), {}
+    for variant in variants:
+        seeds, steps, table = scores(results.frame, env, variant)
+        if not seeds:
+            continue
+        color = style.color_of(variant, list(variants))
+        x = np.array(steps) / unit
+        values = table.to_numpy().T  # (S, T)
+        for curve in values:
+            axes.plot(x, curve, color=color, alpha=0.4, linewidth=0.8)
+        complete = ~np.isnan(values).any(0)  # the mean goes as far as every seed does
+        interval = stats.bootstrap_mean(values[:, complete])
+        axes.plot(x[complete], interval.point, color=color)
+        axes.fill_between(x[complete], interval.low, interval.high, color=color, alpha=0.15, linewidth=0)
+        seeds_drawn[variant] = len(seeds)
+    return seeds_drawn
+
+
+def caption(results: Results, seeds: dict[str, dict[str, int]]) -> str:
+    """What the picture shows and how it was computed, for a reader who sees nothing else."""
+    plan = results.plan
+    counts = sorted({n for env in seeds.values() for n in env.values()})
+    n = f"{counts[0]}" if len(counts) == 1 else f"{counts[0]} to {counts[-1]} (printed in each panel)"
+    physics = ", ".join(sorted({f"{run['env_label']}: {run['physics']} physics" for run in plan["runs"]}))
+    lines = [
+        f"{plan['title']}. Scale: {plan['scale']}.",
+        f"Mean undiscounted return of the episodes that open an iteration, against environment steps. n = {n} seeds; "
+        "line: mean over seeds; thin lines: single seeds; no smoothing.",
+        f"Shaded: {stats.LEVEL:.0%} percentile bootstrap interval of the mean over seeds, {stats.RESAMPLES} resamples, "
+        "pointwise. With fewer than about ten seeds it covers less than it says and decides nothing.",
+        f"Physics: {physics}.",
+    ]
+    if plan["scale"] in NOT_A_RESULT:
+        lines.append("Smoke scale runs every code path in minutes; it says nothing about the methods.")
+    for run in results.missing:
+        lines.append(f"Missing or incomplete: {run['env']} {run['variant']} seed {run['seed']} ({run['state']}).")
+    return "\n".join(lines) + "\n"
+
+
+def provenance(results: Results) -> str:
+    """The runs behind the picture, as one line."""
+    ids = sorted(set(results.frame["run_id"]))
+    digest = hashlib.sha256(" ".join(ids).encode()).hexdigest()[:12]
+    return f"{len(ids)} runs, set {digest}: {' '.join(ids)}"
+
+
+def draw(results: Results, out: Path) -> list[Path]:
+    """Draw and write <figure>.csv, .pdf, .png and .caption.txt under `out`/<scale>/; returns the paths."""
+    style.use()
+    plan = results.plan
+    environments, variants = unique(results, "env"), unique(results, "variant")
+    columns = min(4, len(environments))
+    rows = -(-len(environments) // columns)
+    figure, grid = plt.subplots(
+        rows, columns, figsize=(style.WIDTH, 2.25 * rows + 0.55), squeeze=False, layout="constrained"
+    )
+    seeds = {}
+    for axes, (env, label) in zip(grid.flat, environments.items(), strict=False):
+        steps = results.frame.loc[results.frame["env"] == env, "env_steps"]
+        unit, name = (1e6, "million") if len(steps) and steps.max() >= 5e5 else (1e3, "thousand")
+        axes.patch.set_visible(False)  # a watermark shows from behind
+        seeds[env] = draw_panel(axes, results, env, unit)
+        axes.set_title(label)
+        axes.set_xlabel(f"{name} env. steps")
+        if not seeds[env]:
+            axes.text(0.5, 0.5, "not trained\nat this scale", transform=axes.transAxes, ha="center", va="center")
+            axes.set_xticks([])
+            axes.set_yticks([])
+            continue
+        axes.margins(x=0)
+        n = seeds[env]
+        different = ", ".join(f"{variants[v]}: {count}" for v, count in n.items())
+        text = f"n = {min(n.values())}" if len(set(n.values())) == 1 else f"n: {different}"
+        axes.text(0.98, 0.02, text, transform=axes.transAxes, ha="right", va="bottom", fontsize=6.5, color="#555555")
+    for axes in list(grid.flat)[len(environments) :]:
+        axes.set_axis_off()
+    for axes in grid[:, 0]:
+        axes.set_ylabel("return")
+    handles = [Line2D([], [], color=style.color_of(v, list(variants)), label=label) for v, label in variants.items()]
+    figure.legend(handles=handles, loc="outside upper center", ncols=min(5, len(handles)), columnspacing=1.2)
+    if plan["scale"] in NOT_A_RESULT:
+        style.watermark(figure, NOT_A_RESULT[plan["scale"]])
+    stem = out / plan["scale"] / plan["figure"]
+    paths = style.save(figure, stem, f"{plan['figure']}: {plan['title']}", provenance(results))
+    plt.close(figure)
+    csv, text_path = stem.with_suffix(".csv"), stem.with_suffix(".caption.txt")
+    results.frame.to_csv(csv, index=False, lineterminator="\n")
+    text_path.write_text(caption(results, seeds))
+    return [csv, *paths, text_path]
+
+
+def main(figure: str, arguments: Sequence[str] | None = None) -> int:
+    """Draw one figure from the command line; exit code 2 where there is nothing to draw."""
+    parser = argparse.ArgumentParser(prog=f"paper_figures.{figure}", description=f"Draw {figure}.")
+    parser.add_argument("--scale", default="smoke", help="smoke, laptop or paper")
+    parser.add_argument("--runs-dir", type=Path, default=Path("runs"))
+    parser.add_argument("--data", type=Path, default=HERE / "data", help="committed results")
+    parser.add_argument("--out", type=Path, default=HERE / "out")
+    options = parser.parse_args(arguments)
+    try:
+        results = load(figure, options.scale, options.runs_dir, options.data)
+    except MissingData as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    for run in results.missing:
+        print(f"missing or incomplete: {run['env']} {run['variant']} seed {run['seed']} ({run['state']})")
+    print("wrote " + " ".join(str(path) for path in draw(results, options.out)))
+    return 0

@@ -1,0 +1,80 @@
+"""How every figure looks: colours by method, sizes in inches at the printed scale, byte-stable files."""
+
+import os
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+from matplotlib.figure import Figure
+
+WIDTH = 7.2  # in; the text width of a page, so that nothing is scaled in print
+
+# Okabe and Ito's palette, told apart by readers with any colour vision; a method has one colour in every figure.
+COLORS = {
+    "hippo_random": "#0072B2",
+    "hippo_p10": "#56B4E9",
+    "hippo_p1": "#CC79A7",
+    "ppo": "#D55E00",
+    "ppo_repeat": "#E69F00",
+    "hier_vpg": "#009E73",
+}
+SPARE_COLORS = ("#000000", "#7F7F7F", "#8C564B", "#17BECF")
+
+RC: dict[str, Any] = {
+    "font.family": "DejaVu Sans",
+    "font.size": 8,
+    "axes.titlesize": 9,
+    "axes.labelsize": 8,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": "#E6E6E6",
+    "grid.linewidth": 0.6,
+    "legend.frameon": False,
+    "lines.linewidth": 1.6,
+    "pdf.fonttype": 42,
+    "svg.hashsalt": "hippo-suite",
+    "figure.dpi": 100,
+}
+
+
+def color_of(variant: str, variants: list[str]) -> str:
+    """The colour of a method; one without a colour of its own takes a spare one by its place."""
+    if variant in COLORS:
+        return COLORS[variant]
+    others = [v for v in variants if v not in COLORS]
+    return SPARE_COLORS[others.index(variant) % len(SPARE_COLORS)]
+
+
+def use() -> None:
+    """Set matplotlib up: no display, our look."""
+    mpl.use("Agg")
+    mpl.rcParams.update(mpl.rcParamsDefault)
+    mpl.rcParams.update(RC)  # type: ignore[arg-type]
+
+
+def watermark(figure: Figure, text: str) -> None:
+    """Write `text` large and pale across the figure."""
+    figure.text(
+        0.5, 0.42, text, fontsize=80, color="#BBBBBB", alpha=0.45, ha="center", va="center", rotation=18, zorder=0
+    )
+
+
+def save(figure: Figure, stem: Path, title: str, provenance: str) -> list[Path]:
+    """Write `stem`.pdf and `stem`.png; the same figure gives the same bytes.
+
+    Args:
+        provenance: which runs and which commit stand behind it; goes into the files' metadata.
+    """
+    stem.parent.mkdir(parents=True, exist_ok=True)
+    pdf, png = stem.with_suffix(".pdf"), stem.with_suffix(".png")
+    information = {"Title": title, "Creator": "hippo-suite", "Keywords": provenance}
+    for path, metadata in (
+        (pdf, information | {"CreationDate": None, "Producer": None}),
+        (png, {"Title": title, "Software": "hippo-suite", "Description": provenance}),
+    ):
+        temporary = path.with_name(f"{path.stem}.tmp{path.suffix}")
+        figure.savefig(temporary, metadata=metadata, dpi=220)
+        os.replace(temporary, path)
+    return [pdf, png]
