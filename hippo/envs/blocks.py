@@ -133,7 +133,7 @@ class Blocks:
     def step(self) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
         """Reward (N,), terminated (N,) and the reward's terms, read from the new state."""
         x = self.com[:, 0]
-        ahead = next_wall(np.where(np.isfinite(x), x, 0.0), self.track)
+        ahead = next_wall(x, self.track)
         moved = np.flatnonzero(ahead != self.ahead)
         self.ahead = ahead
         if len(moved):

@@ -64,6 +64,7 @@ def perturb(spec: mujoco.MjSpec, robot: str, quantity: str, strength: str) -> No
     change = change_of(robot, quantity, strength, spec)
     if quantity in ("mass", "inertia"):
         model = spec.compile()
+        spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO  # explicit ones count
         for body in spec.bodies:
             compiled = model.body(body.name)
             if body.name == "world" or compiled.mass[0] == 0:

@@ -121,8 +121,10 @@ class RobotTaskEnv(gym.vector.VectorEnv):
         self.physics.step()
         self._clock += 1
 
-        reward, terminated, info = self.task.step()
         diverged = self.physics.diverged()
+        if diverged.any():  # these simulations end here; the task must not read what is not finite
+            self._pose(np.flatnonzero(diverged))
+        reward, terminated, info = self.task.step()
         if diverged.any():
             reward, terminated = np.where(diverged, 0.0, reward), terminated & ~diverged
             info = {name: np.where(diverged, 0.0, term) for name, term in info.items()}
@@ -144,17 +146,20 @@ class RobotTaskEnv(gym.vector.VectorEnv):
         self._obs = obs
         return obs.copy(), reward, terminated, truncated, info
 
-    def _new_episodes(self, ids: np.ndarray) -> None:
+    def _pose(self, ids: np.ndarray) -> None:
+        """Put the robots of simulations `ids` into their noisy initial pose."""
         model = self.physics.model
         qpos, qvel = np.empty((len(ids), model.nq)), np.empty((len(ids), model.nv))
         for row, i in enumerate(ids):
             qpos[row] = self._qpos + POSE_NOISE * self._rngs[i].standard_normal(model.nq)
             qvel[row] = VELOCITY_NOISE * self._rngs[i].standard_normal(model.nv)
-        fixed = self._layout_seed
-        layouts = [self._rngs[i] if fixed is None else np.random.default_rng(fixed) for i in ids]
         self.physics.reset(ids, qpos, qvel)
-        self.task.reset(ids, layouts)
         self.physics.forward(ids)
+
+    def _new_episodes(self, ids: np.ndarray) -> None:
+        self._pose(ids)
+        fixed = self._layout_seed
+        self.task.reset(ids, [self._rngs[i] if fixed is None else np.random.default_rng(fixed) for i in ids])
         self._clock[ids] = 0
 
     def _observe(self) -> np.ndarray:

@@ -1,0 +1,122 @@
+"""The Block task: which wall is next, the ring of mocap bodies, rewards, and that the walls are really there."""
+
+from types import SimpleNamespace
+
+import mujoco
+import numpy as np
+import pytest
+
+from hippo.envs import blocks, make
+
+TRACK = blocks.Track(first_wall=2.0, low=0.1, high=0.3)
+
+
+def test_the_next_wall_is_the_first_whose_far_face_is_ahead():
+    # Far faces at 2.05, 4.05, 6.05.
+    x = np.array([-5.0, 0.0, 2.0, 2.04, 2.06, 4.0, 4.06, 6.1])
+    assert blocks.next_wall(x, TRACK).tolist() == [0, 0, 0, 0, 1, 1, 2, 3]
+
+
+def test_the_observation_of_both_walls_worked_by_hand():
+    heights = np.tile(np.arange(512) / 100, (2, 1))
+    out = blocks.observe(np.array([1.0, 5.0]), np.array([0, 2]), heights, TRACK)
+    assert out[0].tolist() == [0.0, 0.1, 2.0, 1.0, 0, 0, 0, 0]  # nothing before the first wall
+    assert out[1].tolist() == pytest.approx([0.02, 0.1, 6.0, 1.0, 0.01, 0.1, 4.0, -1.0])
+
+
+def test_the_ring_holds_four_walls_behind_and_eight_ahead_each_in_its_own_slot():
+    for ahead in (0, 3, 4, 5, 17, 100):
+        index = blocks.ring_indices(np.array([ahead]))[0]
+        start = max(ahead - 4, 0)
+        assert sorted(index.tolist()) == list(range(start, start + 12))
+        assert (index % 12 == np.arange(12)).all()  # a wall keeps its body while it stands
+
+
+def test_heights_are_uniform_in_the_tracks_range():
+    heights = blocks.draw_heights(np.random.default_rng(0), TRACK)
+    assert heights.min() >= 0.1
+    assert heights.max() <= 0.3
+    assert heights.mean() == pytest.approx(0.2, abs=0.02)
+
+
+def driven(xs, robot="hopper"):
+    """Rewards of a Block task whose robot's centre of mass is moved along `xs`."""
+    task = blocks.Blocks(SimpleNamespace(name=robot), SimpleNamespace(terminate_on_fall=False), 1)
+    task.physics, task.com = SimpleNamespace(mocap_pos=np.zeros((1, 12, 3))), np.zeros((1, 3))
+    task.reset(np.array([0]), [np.random.default_rng(0)])
+    rewards = []
+    for x in xs:
+        task.com[0, 0] = x
+        rewards.append(float(task.step()[0][0]))
+    return rewards
+
+
+def test_a_wall_pays_once_in_order_and_also_several_in_one_step():
+    assert driven([0, 2.04, 2.06, 1.0, 2.06, 4.1, 0.0, 4.1]) == [0, 0, 1, 0, 0, 1, 0, 0]
+    assert driven([6.1]) == [3]
+    assert driven([1.5, 1.56], "half_cheetah") == [0, 1]  # its first far face is at 1.55
+
+
+@pytest.mark.parametrize("name", ["block_hopper", "block_half_cheetah"])
+def test_a_probe_dropped_on_every_wall_rests_at_its_drawn_height(name):
+    """Also after a second reset and after the ring has turned."""
+    env = make(name, 2, 0)
+    env.reset(seed=1)
+    rng = np.random.default_rng(0)
+    for phase in ("first episode", "second episode", "turned ring"):
+        if phase == "second episode":
+            env.reset()
+        if phase == "turned ring":
+            x = list(env.observation_names).index("com_x")
+            env.physics.qpos[:, 1 if name == "block_hopper" else 0] += 9.0
+            env.physics.forward(np.arange(2))
+            obs = env.step(rng.uniform(-0.1, 0.1, env.action_space.shape))[0]
+            assert (obs[:, x] > 8).all()
+            assert (env.task.ahead >= 4).all()
+        for i in range(2):
+            index = blocks.ring_indices(env.task.ahead)[i]
+            expected = blocks.height_of(index[None], env.task.heights[i : i + 1])[0]
+            np.testing.assert_allclose(rest_heights(env, i), expected, rtol=0, atol=5e-3)  # contacts are soft
+    assert np.ptp(env.task.heights) > 0.1  # otherwise any height would do
+
+
+def rest_heights(env, i, radius=0.02):
+    """Where small spheres come to rest on the walls of simulation i: the same model plus one free sphere a wall."""
+    spec = env.robot.spec("paper")
+    env.task.build(spec)
+    for slot, position in enumerate(env.physics.mocap_pos[i]):
+        body = spec.worldbody.add_body(name=f"probe_{slot}", pos=[position[0], 2.0, position[2] + 1.0 + radius + 0.01])
+        body.add_freejoint()
+        body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=[radius] * 3, density=500, condim=3)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    data.mocap_pos[:] = env.physics.mocap_pos[i]
+    while data.time < 0.6:
+        mujoco.mj_step(model, data)
+    mujoco.mj_forward(model, data)
+    return np.array([data.body(f"probe_{slot}").xpos[2] - radius for slot in range(blocks.RING)])
+
+
+@pytest.mark.parametrize(("height", "passes"), [(0.9, False), (0.001, True)])
+def test_a_pushed_robot_passes_low_walls_and_is_held_by_high_ones(height, passes, monkeypatch):
+    monkeypatch.setitem(blocks.TRACKS, "half_cheetah", blocks.Track(1.5, height, height))
+    env = make("block_half_cheetah", 10, 0)
+    env.reset(seed=0)
+    rng, total = np.random.default_rng(0), 0.0
+    for t in range(200):
+        if t % 20 == 0:
+            env.physics.qvel[:, 0] = 3.0
+        total += env.step(rng.standard_normal((10, 6)))[1].sum()
+    assert total > 20 if passes else total == 0
+
+
+def test_nothing_but_the_horizon_ends_an_episode_unless_falling_does():
+    for terminate, expected in ((False, False), (True, True)):
+        env = make("block_hopper", 4, 0, terminate_on_fall=terminate)
+        env.reset(seed=0)
+        rng, ended = np.random.default_rng(0), False
+        for _ in range(60):
+            _, _, terminated, truncated, _ = env.step(rng.standard_normal((4, 3)))
+            ended |= bool(terminated.any())
+            assert not truncated.any()
+        assert ended is expected

@@ -1,0 +1,82 @@
+"""BatchPhysics: exactly a plain `mj_step` loop, current derived fields, and contained divergence."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from hippo.envs import ENVIRONMENTS, make
+
+STEPS = {"ant_gather": 60, "snake_gather": 10, "block_hopper": 150, "block_half_cheetah": 100}
+
+
+@pytest.mark.parametrize("num_threads", [1, 2])
+@pytest.mark.parametrize("name", ENVIRONMENTS)
+def test_batch_stepping_is_exactly_a_plain_loop(name, num_threads):
+    env = make(name, 3, 0, num_threads=num_threads)
+    env.reset(seed=3)
+    physics, model = env.physics, env.physics.model
+    datas = [mujoco.MjData(model) for _ in range(3)]
+    for data, row in zip(datas, physics.get_state(), strict=True):
+        mujoco.mj_setState(model, data, row, mujoco.mjtState.mjSTATE_INTEGRATION)
+    rng = np.random.default_rng(0)
+    for _ in range(STEPS[name]):
+        for i, data in enumerate(datas):
+            data.mocap_pos[:] = physics.mocap_pos[i]
+        _, _, terminated, _, _ = env.step(rng.uniform(-1, 1, (3, model.nu)))
+        assert not terminated.any()
+        for i, data in enumerate(datas):
+            data.ctrl[:] = physics.ctrl[i]
+            for _ in range(physics.frame_skip):
+                mujoco.mj_step(model, data)
+            assert np.array_equal(data.qpos, physics.qpos[i])
+            assert np.array_equal(data.qvel, physics.qvel[i])
+
+
+@pytest.mark.parametrize("name", ENVIRONMENTS)
+def test_derived_fields_are_those_of_the_new_state(name):
+    env = make(name, 2, 0)
+    env.reset(seed=0)
+    physics, model = env.physics, env.physics.model
+    data = mujoco.MjData(model)
+    for _ in range(3):
+        env.step(np.full((2, model.nu), 0.7))
+    mujoco.mj_setState(model, data, physics.get_state()[1], mujoco.mjtState.mjSTATE_INTEGRATION)
+    mujoco.mj_forward(model, data)
+    com = physics.bind("subtree_com")[1, 1]
+    np.testing.assert_allclose(com, data.subtree_com[1], rtol=0, atol=1e-12)
+    for _ in range(physics.frame_skip):
+        mujoco.mj_step(model, data)  # leaves the derived fields one physics step behind
+    stale = data.subtree_com[1].copy()
+    mujoco.mj_forward(model, data)
+    assert np.abs(data.subtree_com[1] - stale).max() > 1e-7
+
+
+def test_mujocos_silent_reset_of_a_diverged_simulation_is_off():
+    flags = make("ant_gather", 1, 0).physics.model.opt.disableflags
+    assert flags & mujoco.mjtDisableBit.mjDSBL_AUTORESET
+
+
+@pytest.mark.parametrize("name", ENVIRONMENTS)
+@pytest.mark.parametrize("bad", [np.nan, 1e6])
+def test_a_diverged_simulation_ends_alone(name, bad):
+    def trajectory(inject):
+        env = make(name, 4, 0)
+        env.reset(seed=5)
+        rng, rows = np.random.default_rng(1), []
+        for t in range(12):
+            if inject and t == 6:
+                env.physics.qvel[2, 0] = bad
+            rows.append(env.step(rng.uniform(-1, 1, env.action_space.shape)))
+        return rows
+
+    clean, injected = trajectory(False), trajectory(True)
+    others = [0, 1, 3]
+    for t, (expected, got) in enumerate(zip(clean, injected, strict=True)):
+        assert np.array_equal(expected[0][others], got[0][others])
+        assert np.array_equal(expected[1][others], got[1][others])
+        assert np.isfinite(got[0]).all()
+        assert got[4]["diverged"].tolist() == [False, False, t == 6, False]
+    _, reward, terminated, truncated, info = injected[6]
+    assert (reward[2], terminated[2], truncated[2]) == (0.0, False, True)
+    assert np.array_equal(info["final_obs"][2], injected[5][0][2])  # the last finite observation
+    assert info["_final_obs"].tolist() == [False, False, True, False]

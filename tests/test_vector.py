@@ -1,0 +1,210 @@
+"""RobotTaskEnv: seeding, same-step autoreset, the horizon, exact continuation, and what it refuses."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from hippo.envs import ENVIRONMENTS, make
+
+everywhere = pytest.mark.parametrize("name", ENVIRONMENTS)
+
+
+def actions(env, steps, seed=0):
+    return np.random.default_rng(seed).uniform(-1, 1, (steps, *env.action_space.shape))
+
+
+def played(env, moves):
+    return [env.step(a) for a in moves]
+
+
+def same(a, b):
+    return all(
+        np.array_equal(x, y) for left, right in zip(a, b, strict=True) for x, y in zip(left[:4], right[:4], strict=True)
+    )
+
+
+@everywhere
+def test_a_seed_decides_everything_and_resets_differ(name):
+    env = make(name, 2, 0, horizon=5)
+    moves = actions(env, 12)
+    first, _ = env.reset(seed=4)
+    rows = played(env, moves)
+    again, _ = env.reset(seed=4)
+    assert np.array_equal(first, again)
+    assert same(rows, played(env, moves))
+    later, _ = env.reset()
+    other, _ = env.reset(seed=5)
+    assert not np.array_equal(first, later)
+    assert not np.array_equal(first, other)
+    assert not np.array_equal(first[0], first[1])
+
+
+@everywhere
+def test_environment_i_of_many_is_environment_i_alone(name):
+    many, alone = make(name, 5, 0, horizon=6), make(name, 1, 0, horizon=6)
+    moves = actions(many, 10)
+    obs, _ = many.reset(seed=11)
+    single, _ = alone.reset(seed=[14])
+    assert np.array_equal(obs[3], single[0])
+    for a in moves:
+        expected, got = many.step(a), alone.step(a[3:4])
+        assert all(np.array_equal(x[3], y[0]) for x, y in zip(expected[:4], got[:4], strict=True))
+
+
+@everywhere
+def test_at_the_horizon_the_last_observation_is_kept_and_the_next_episode_has_begun(name):
+    long, short = make(name, 3, 0, horizon=50), make(name, 3, 0, horizon=4)
+    moves = actions(long, 4)
+    long.reset(seed=2)
+    short.reset(seed=2)
+    expected, got = played(long, moves), played(short, moves)
+    for t in range(3):
+        assert "final_obs" not in got[t][4]
+        assert not got[t][3].any()
+    obs, reward, terminated, truncated, info = got[3]
+    assert truncated.all()
+    assert not terminated.any()
+    assert info["_final_obs"].all()
+    assert np.array_equal(info["final_obs"], expected[3][0])
+    assert np.array_equal(reward, expected[3][1])
+    assert not np.array_equal(obs, expected[3][0])
+    assert np.array_equal(info["final_info"]["diverged"], [False] * 3)
+    assert not short.step(moves[0])[3].any()  # the clock has started again
+
+
+@everywhere
+def test_continuation_from_a_state_is_bit_identical_also_in_another_environment(name):
+    env = make(name, 3, 0, horizon=7)
+    env.reset(seed=1, options={"layout_seed": None})
+    moves = actions(env, 20)
+    played(env, moves[:5])
+    state = env.get_state()
+    expected = played(env, moves[5:])  # over two autoresets
+    env.set_state(state)
+    assert same(expected, played(env, moves[5:]))
+    other = make(name, 3, 99, horizon=7)
+    other.set_state(state)
+    assert same(expected, played(other, moves[5:]))
+
+
+@everywhere
+def test_returned_arrays_share_no_memory(name):
+    env = make(name, 2, 0, horizon=2)
+    env.reset(seed=0)
+    rows = played(env, actions(env, 4))
+    arrays = [x for row in rows for x in (*row[:4], *(v for v in row[4].values() if isinstance(v, np.ndarray)))]
+    for i, a in enumerate(arrays):
+        assert not any(np.shares_memory(a, b) for b in arrays[i + 1 :] if b is not a)
+    kept = rows[0][0].copy()
+    env.step(actions(env, 1)[0])
+    assert np.array_equal(rows[0][0], kept)
+
+
+@pytest.mark.parametrize("options", [{}, {"velocity_penalty": True}])
+def test_the_reward_is_the_sum_of_its_terms(options):
+    env = make("ant_gather", 6, 0, **options)
+    env.reset(seed=0)
+    env.physics.qpos[:2, 2] = 5.0
+    env.physics.qvel[:, 0] = 4.0
+    env.physics.forward(np.arange(6))
+    total = 0.0
+    for a in actions(env, 30):
+        _, reward, _, _, info = env.step(a)
+        terms = sum(v for k, v in info.items() if k.startswith("reward_")) - info.get("velocity_penalty", 0.0)
+        np.testing.assert_allclose(reward, terms, rtol=0, atol=1e-15)
+        total += np.abs(reward).sum()
+    assert total >= 20  # two deaths at least
+
+
+@everywhere
+def test_observations_have_their_dtype_and_stay_in_their_space(name):
+    env = make(name, 4, 0)
+    obs, _ = env.reset(seed=0)
+    assert obs.dtype == np.float32
+    for a in actions(env, 40):
+        obs, reward, terminated, truncated, _ = env.step(3 * a)
+        assert env.observation_space.contains(obs)
+        assert (reward.dtype, terminated.dtype, truncated.dtype) == (np.float64, bool, bool)
+
+
+def test_actions_are_clipped_and_mapped_to_the_controls():
+    env = make("block_hopper", 2, 0)
+    env.reset(seed=0)
+    env.step(np.array([[0.5, -2.0, 1.0], [0.0, 1.5, -0.25]]))
+    assert env.physics.ctrl.tolist() == [[100, -200, 200], [0, 200, -50]]
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments", "message"),
+    [
+        ("ant_gatherer", {}, "env=ant_gatherer"),
+        ("ant_gather", {"num_envs": 0}, "num_envs=0"),
+        ("ant_gather", {"horizon": 0}, "horizon=0"),
+        ("ant_gather", {"wind": 1}, "wind=1"),
+        ("ant_gather", {"physics": "slow"}, "physics=slow"),
+        ("ant_gather", {"observation": "ego"}, "observation=ego"),
+        ("block_hopper", {"velocity_penalty": True}, "velocity_penalty=True"),
+        ("snake_gather", {"velocity_penalty": "yes"}, "velocity_penalty=yes"),
+        ("block_hopper", {"perturbation": "mass"}, "strength=original"),
+        ("snake_gather", {"perturbation": "colour"}, "perturbation=colour"),
+    ],
+)
+def test_bad_arguments_are_refused_by_name(name, arguments, message):
+    with pytest.raises(ValueError, match=message):
+        make(name, **({"num_envs": 1, "seed": 0} | arguments))
+
+
+def test_bad_calls_are_refused():
+    env = make("block_hopper", 2, 0)
+    with pytest.raises(gym.error.ResetNeeded):
+        env.step(np.zeros((2, 3)))
+    with pytest.raises(ValueError, match="wall_seed"):
+        env.reset(options={"wall_seed": 1})
+    with pytest.raises(ValueError, match="seed="):
+        env.reset(seed=[1, 2, 3])
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match=r"\(2, 4\)"):
+        env.step(np.zeros((2, 4)))
+    with pytest.raises(ValueError, match="1 non-finite"):
+        env.step(np.array([[0.0, np.nan, 0.0], [0.0, 0.0, 0.0]]))
+    env.close()
+    with pytest.raises(gym.error.ClosedEnvironmentError):
+        env.reset()
+    with pytest.raises(gym.error.ClosedEnvironmentError):
+        env.step(np.zeros((2, 3)))
+
+
+@pytest.mark.parametrize("quantity", ["mass", "damping", "inertia", "friction"])
+@pytest.mark.parametrize("name", ["ant_gather", "snake_gather"])
+def test_a_perturbation_scales_exactly_the_authors_elements(name, quantity):
+    base = make(name, 1, 0).physics.model
+    model = make(name, 1, 0, perturbation=quantity).physics.model
+    fields = {"mass": "body_mass", "damping": "dof_damping", "inertia": "body_inertia", "friction": "geom_friction"}
+    for other, field in fields.items():
+        before, after = getattr(base, field), getattr(model, field)
+        if other != quantity:
+            np.testing.assert_allclose(after, before, rtol=1e-12, err_msg=other)
+    # Body and geom counts scaled: Ant 6 bodies (inertia by 1.3), hip_1 alone has damping; floor, 4 walls, 4 of the Ant.
+    before, after = getattr(base, fields[quantity]), getattr(model, fields[quantity])
+    rows = np.flatnonzero(np.abs(after - before).reshape(len(before), -1).max(1) > 1e-9)
+    counts = {
+        "ant_gather": {"mass": 6, "damping": 1, "inertia": 6, "friction": 9},
+        "snake_gather": {"mass": 2, "damping": 0, "inertia": 2, "friction": 3},
+    }
+    assert len(rows) == counts[name][quantity]
+    factor = 1.3 if (name, quantity) == ("ant_gather", "inertia") else 1.5
+    np.testing.assert_allclose(after[rows], before[rows] * factor, rtol=1e-9)
+    if quantity == "mass":
+        assert model.body_mass.sum() == pytest.approx({"ant_gather": 1.1866, "snake_gather": 213.63}[name], rel=1e-4)
+        np.testing.assert_allclose(model.body_subtreemass[1], model.body_mass.sum())
+
+
+@pytest.mark.parametrize(
+    ("quantity", "changes"), [("damping", False), ("friction", False), ("mass", True), ("inertia", True)]
+)
+def test_two_perturbations_of_the_snake_cannot_change_its_dynamics(quantity, changes):
+    env, perturbed = make("snake_gather", 2, 0), make("snake_gather", 2, 0, perturbation=quantity)
+    env.reset(seed=0)
+    perturbed.reset(seed=0)
+    moves = actions(env, 20)
+    assert same(played(env, moves), played(perturbed, moves)) is not changes
