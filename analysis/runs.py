@@ -63,7 +63,7 @@ def read_progress(path: Path, metrics: Sequence[str]) -> pd.DataFrame:
     if not path.exists():
         return pd.DataFrame(columns=["env_steps", "metric", "value"])
     text = path.read_text()
-    table = pd.read_csv(io.StringIO(text[: text.rfind("\n") + 1]), float_precision="round_trip")
+    table = pd.read_csv(io.StringIO(text[: text.rfind("\n") + 1]))
     return table.melt(id_vars="env_steps", value_vars=list(metrics), var_name="metric")
 
 
@@ -71,7 +71,7 @@ def read_committed(path: Path) -> pd.DataFrame:
     """Committed rows of a figure, empty where there are none."""
     if not path.exists():
         return pd.DataFrame(columns=COLUMNS)
-    return pd.read_csv(path, dtype={"run_id": str}, float_precision="round_trip")
+    return pd.read_csv(path, dtype={"run_id": str})
 
 
 def scores(frame: pd.DataFrame, env: str, variant: str) -> tuple[list[Any], list[Any], pd.DataFrame]:

@@ -72,8 +72,11 @@ def physics_and_environment(name: str, num_envs: int, seconds: float, rounds: in
         env.step(actions[clock["environment"] % 256])
         clock["environment"] += 1
 
-    pairs = [(rate(step_bare, num_envs, seconds), rate(step_environment, num_envs, seconds)) for _ in range(rounds)]
-    return statistics.median(p[0] for p in pairs), statistics.median(p[1] for p in pairs)
+    bare_rates, environment_rates = [], []
+    for _ in range(rounds):
+        bare_rates.append(rate(step_bare, num_envs, seconds))
+        environment_rates.append(rate(step_environment, num_envs, seconds))
+    return statistics.median(bare_rates), statistics.median(environment_rates)
 
 
 def training(run: Run, iterations: int) -> float:
