@@ -47,8 +47,9 @@ def load(figure: str, scale: str, runs_dir: Path, data_dir: Path, metrics: Seque
             rows = committed.loc[committed["run_id"] == run["run_id"], ["env_steps", "metric", "value"]]
         if rows.empty or rows.groupby("metric").size().min() < run["iterations"]:
             missing.append(run)
-        labels = {key: run[key] for key in ("env", "variant", "seed", "run_id")}
-        parts.append(rows.assign(figure=figure, scale=scale, **labels))
+        if not rows.empty:  # an empty part would turn numbers into objects
+            labels = {key: run[key] for key in ("env", "variant", "seed", "run_id")}
+            parts.append(rows.assign(figure=figure, scale=scale, **labels))
     frame = pd.concat(parts, ignore_index=True)[COLUMNS] if parts else pd.DataFrame(columns=COLUMNS)
     if frame.empty:
         raise MissingData(f"{figure}: none of its {len(plan['runs'])} runs at scale {scale} has a result yet")
@@ -63,7 +64,10 @@ def read_progress(path: Path, metrics: Sequence[str]) -> pd.DataFrame:
     if not path.exists():
         return pd.DataFrame(columns=["env_steps", "metric", "value"])
     text = path.read_text()
-    table = pd.read_csv(io.StringIO(text[: text.rfind("\n") + 1]))
+    whole = text[: text.rfind("\n") + 1]
+    if not whole:
+        return pd.DataFrame(columns=["env_steps", "metric", "value"])
+    table = pd.read_csv(io.StringIO(whole))
     return table.melt(id_vars="env_steps", value_vars=list(metrics), var_name="metric")
 
 
@@ -74,8 +78,10 @@ def read_committed(path: Path) -> pd.DataFrame:
     return pd.read_csv(path, dtype={"run_id": str})
 
 
-def scores(frame: pd.DataFrame, env: str, variant: str) -> tuple[list[Any], list[Any], pd.DataFrame]:
+def scores(
+    frame: pd.DataFrame, env: str, variant: str, metric: str = "return_mean"
+) -> tuple[list[Any], list[Any], pd.DataFrame]:
     """One curve bundle: its seeds, its environment steps and a (steps x seeds) table, NaN where a run stopped."""
-    chosen = frame[(frame["env"] == env) & (frame["variant"] == variant)]
+    chosen = frame[(frame["env"] == env) & (frame["variant"] == variant) & (frame["metric"] == metric)]
     table = chosen.pivot_table(index="env_steps", columns="seed", values="value", dropna=False).sort_index()
     return list(table.columns), list(table.index), table

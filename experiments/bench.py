@@ -59,7 +59,7 @@ def physics_and_environment(name: str, num_envs: int, seconds: float, rounds: in
     ctrl, rng = bare.bind("ctrl"), np.random.default_rng(0)
     control_range = np.asarray(env.physics.model.actuator_ctrlrange)
     low, high = control_range[:, 0], control_range[:, 1]
-    actions = rng.uniform(-1, 1, (256, *env.action_space.shape))
+    actions = rng.uniform(-1, 1, (256, *(env.action_space.shape or ())))
     controls = low + (actions + 1) / 2 * (high - low)
     clock = {"bare": 0, "environment": 0}
 

@@ -174,7 +174,8 @@ def nearest(value: str, valid: Sequence[str]) -> str:
     """A hint at the valid choices, the closest one first if there is one; of many choices only the closest five."""
     close = difflib.get_close_matches(value, valid, n=5, cutoff=0.6 if len(valid) <= 12 else 0.3)
     suggestion = f"did you mean {close[0]}? " if close else ""
-    return f"{suggestion}valid: {', '.join(valid if len(valid) <= 12 else [*close, '...'])}"
+    shown = list(valid) if len(valid) <= 12 else [*(close or valid[:5]), "..."]
+    return f"{suggestion}valid: {', '.join(shown)}"
 
 
 def check_choice(key: str, value: str, valid: Sequence[str]) -> str:
@@ -225,10 +226,13 @@ def compose_run(overrides: Sequence[str]) -> Run:
 def _parse(overrides: Sequence[str]) -> list[Override]:
     parsed = []
     for text in overrides:
-        with _as_config_error(*([*text.split("=", 1), ""][:2])):
+        key, equals, value = text.partition("=")
+        if not key or not equals:
+            raise ConfigError(key, value, "settings are given as key=value")
+        with _as_config_error(key, value):
             (override,) = OverridesParser.create().parse_overrides([text])
         if override.is_sweep_override() or override.is_add() or override.is_delete():
-            raise ConfigError(text, "", "plain key=value overrides only; sweeps are experiments.sweep's")
+            raise ConfigError(key, value, "plain key=value overrides only; sweeps are experiments.sweep's")
         parsed.append(override)
     return parsed
 
@@ -280,6 +284,10 @@ def _validated(config: DictConfig, algo: str) -> Run:
                 raise ConfigError(f"env.{f.name}", env[f.name], str(error).split(": ", 1)[1]) from error
             options[f.name] = env[f.name]
     check_choice("wandb.mode", plain["wandb"]["mode"], WANDB_MODES)
+    if not plain["runs_dir"]:
+        raise ConfigError("runs_dir", "", "must name a folder")
+    if not plain["runs_dir"]:
+        raise ConfigError("runs_dir", "", "must name a folder")
     if not 0 <= plain["seed"] < 2**32:
         raise ConfigError("seed", plain["seed"], "must be at least 0 and below 2**32")
     return Run(

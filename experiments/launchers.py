@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments.config import Run
+from experiments.train import execute, mark_lost
 
 POLL_SECONDS = 1.0
 
@@ -29,8 +30,6 @@ class Worker:
 def _work(connection: Connection) -> None:
     """Body of a worker process: train what arrives, answer with its final state, until the pipe closes."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to the parent, which sends SIGTERM
-    from experiments.train import execute
-
     while True:
         try:
             text, runs_dir = connection.recv()
@@ -42,6 +41,11 @@ def _work(connection: Connection) -> None:
             os.dup2(log.fileno(), 1)
             os.dup2(log.fileno(), 2)
         connection.send(execute(run))
+
+
+def cause(exit_code: int) -> str:
+    """Why a process ended, in words: the signal's name for a negative code."""
+    return signal.Signals(-exit_code).name if exit_code < 0 else f"exit code {exit_code}"
 
 
 def run_locally(runs: Sequence[Run], workers: int, on_change: Callable[[dict[str, Run], int], None]) -> dict[str, str]:
@@ -89,7 +93,10 @@ def run_locally(runs: Sequence[Run], workers: int, on_change: Callable[[dict[str
                 except (EOFError, ConnectionResetError):
                     worker.process.join()
                     states[run.run_id] = "lost"
+                    mark_lost(run, f"its process ended: {cause(worker.process.exitcode)}")
                     pool.remove(worker)
+                    if not queue:
+                        continue
                     worker = start()
                     pool.append(worker)
                 give(worker)

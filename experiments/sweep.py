@@ -9,9 +9,10 @@ import argparse
 import csv
 import json
 import os
+import signal
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,7 @@ COMMITTED = Path(__file__).parent.parent / "paper_figures" / "data"
 LAUNCHERS = ("local",)
 REPORT_SECONDS = 10.0  # between two progress lines
 DONE = ("finished", "committed")
+FIXED = ("env", "algo", "scale", "seed", "runs_dir")  # the plan's own business, not that of --set
 
 
 @dataclass
@@ -48,11 +50,12 @@ class Plan:
     scale: str
     title: str
     claims: list[str]
+    notes: list[str]
     entries: list[Entry]
 
     def todo(self) -> list[Run]:
-        """Runs that still have to be trained, each once."""
-        return list({e.run.run_id: e.run for e in self.entries if e.state not in DONE}.values())
+        """Runs that still have to be trained, each once; a diverged one would only diverge again."""
+        return list({e.run.run_id: e.run for e in self.entries if e.state not in (*DONE, "diverged")}.values())
 
     def write(self, runs_dir: Path) -> Path:
         """Write the plan for analysis and drawing, which read nothing else but run folders and committed rows."""
@@ -79,6 +82,7 @@ class Plan:
                 for e in self.entries
             ],
             "claims": self.claims,
+            "notes": self.notes,
         }
         write_atomically(path, json.dumps(content, indent=1))
         return path
@@ -103,6 +107,9 @@ def make_plan(figure: str, scale: str, settings: Sequence[str], fresh: bool, run
     """Resolve a figure into runs and look up how each is doing."""
     description = load_figure(figure)
     check_choice("scale", scale, choices("scale"))
+    for setting in settings:
+        if (key := setting.partition("=")[0]) in FIXED:
+            raise ConfigError(f"set {key}", setting.partition("=")[2], f"{figure} and the sweep's options decide {key}")
     seeds = yaml.safe_load((CONF / "scale" / f"{scale}.yaml").read_text())["seeds"]
     committed = set() if fresh else committed_runs(figure, scale)
     entries = []
@@ -116,7 +123,7 @@ def make_plan(figure: str, scale: str, settings: Sequence[str], fresh: bool, run
                 if state != "finished" and run.run_id in committed:
                     state = "committed"
                 entries.append(Entry(run, label, variant, what["label"], state))
-    return Plan(figure, scale, description["title"], description["claims"], entries)
+    return Plan(figure, scale, description["title"], description["claims"], description.get("notes", []), entries)
 
 
 def summary(plan: Plan) -> str:
@@ -128,8 +135,35 @@ def summary(plan: Plan) -> str:
     cost = sum(run.estimated_seconds for run in todo)
     return (
         f"{plan.figure} at scale {plan.scale}: {len(runs)} runs ({counts}); to train: {len(todo)} runs, "
-        f"{sum(run.env_steps for run in todo):,} environment steps, about {cost / 3600:.1f} core-hours"
+        f"{sum(run.env_steps for run in todo):,} environment steps, about {duration(cost)} on one core"
     )
+
+
+def duration(seconds: float) -> str:
+    """Seconds in the unit that reads best."""
+    return f"{seconds / 60:.1f} minutes" if seconds < 3600 else f"{seconds / 3600:,.1f} hours"
+
+
+def train_all(todo: Sequence[Run], workers: int, report: Callable[[int, int], None]) -> dict[str, str]:
+    """Train `todo`; runs that another launch is training are waited for, and taken over should it give up.
+
+    Args:
+        report: called about once a second with the number of runs in progress and of those that ended.
+    """
+    states: dict[str, str] = {}
+    here = list(todo)
+    while here:
+        before = len(todo) - len(here)
+        states |= run_locally(here, workers, lambda active, ended, before=before: report(len(active), before + ended))  # type: ignore[misc]
+        elsewhere = [run for run in todo if states[run.run_id] == "running"]
+        here = []
+        while elsewhere and not here:
+            time.sleep(1.0)
+            states |= {run.run_id: read_status(run.folder)["state"] for run in elsewhere}
+            here = [run for run in elsewhere if states[run.run_id] in ("lost", "preempted")]
+            elsewhere = [run for run in elsewhere if states[run.run_id] == "running"]
+            report(len(elsewhere), len(todo) - len(elsewhere) - len(here))
+    return states
 
 
 def run_figure(plan: Plan, workers: int, runs_dir: Path) -> int:
@@ -148,31 +182,34 @@ def run_figure(plan: Plan, workers: int, runs_dir: Path) -> int:
             for i, run in by_id.items()
         )
 
-    def report(active: dict[str, Run], ended: int) -> None:
+    terminal = sys.stdout.isatty()
+
+    def report(running: int, ended: int) -> None:
         nonlocal last_report
-        if time.monotonic() - last_report < REPORT_SECONDS:
+        if time.monotonic() - last_report < (1.0 if terminal else REPORT_SECONDS):
             return
         last_report = time.monotonic()
         elapsed, done = last_report - started, progress()
         eta = clock(elapsed * (total - done) / done) if done > 0 else "unknown"
-        print(f"[{ended}/{len(todo)}] {len(active)} running, elapsed {clock(elapsed)}, ETA {eta}", flush=True)
+        line = f"[{ended}/{len(todo)}] {running} running, elapsed {clock(elapsed)}, ETA {eta}"
+        print(f"\r{line}\x1b[K" if terminal else line, end="" if terminal else "\n", flush=True)
 
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C: every run stays resumable
     try:
-        states = run_locally(todo, workers, report)
+        states = train_all(todo, workers, report)
     except KeyboardInterrupt:
-        print("stopped; the same command continues where it left off", file=sys.stderr)
+        print("\nstopped; the same command continues where it left off", file=sys.stderr)
         return EXIT_REQUEUE
     for entry in plan.entries:
         entry.state = states.get(entry.run.run_id, entry.state)
     plan.write(runs_dir)
-    print(f"[{len(todo)}/{len(todo)}] done in {clock(time.monotonic() - started)}")
-    bad = {i: state for i, state in states.items() if state != "finished"}
-    for run_id, state in bad.items():
-        run, message = by_id[run_id], read_status(by_id[run_id].folder).get("message", "")
-        print(
-            f"{state}: {run.algo} {run.env} seed {run.seed}: {message} (log: {run.folder / 'train.log'})",
-            file=sys.stderr,
-        )
+    if todo:
+        print(f"{'\r' if terminal else ''}[{len(todo)}/{len(todo)}] done in {clock(time.monotonic() - started)}")
+    bad = {e.run.run_id: e for e in plan.entries if e.state not in DONE}
+    for e in bad.values():
+        message = read_status(e.run.folder).get("message", "")
+        where = f"{e.run.env} {e.variant} seed {e.run.seed}"
+        print(f"{e.state}: {where}: {message} (log: {e.run.folder / 'train.log'})", file=sys.stderr)
     return EXIT_FAILED if bad else 0
 
 
@@ -237,7 +274,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.action == "plan":
         return 0
     plan.write(options.runs_dir)
-    return run_figure(plan, options.workers, options.runs_dir) if plan.todo() else 0
+    return run_figure(plan, options.workers, options.runs_dir)
 
 
 if __name__ == "__main__":

@@ -24,7 +24,6 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import psutil
 import torch
 from filelock import FileLock, Timeout
 
@@ -91,20 +90,33 @@ class Status:
 
 def write_atomically(path: Path, text: str) -> None:
     """Replace `path` so that a reader sees the old or the new text, never a part."""
-    temporary = path.with_name(path.name + ".tmp")
-    temporary.write_text(text)
-    temporary.replace(path)
+    temporary = path.with_name(f"{path.name}.{os.getpid()}.tmp")  # two sweeps may write the same plan
+    try:
+        temporary.write_text(text)
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
 
 
 def read_status(folder: Path) -> dict[str, Any]:
-    """A run's status; state "missing" where it never started, "lost" where its heartbeat stopped."""
+    """A run's status; state "missing" where it never started, "lost" where its heartbeat stopped or it is damaged."""
     try:
         status = json.loads((folder / "status.json").read_text())
     except FileNotFoundError:
         return {"state": "missing", "iteration": -1, "message": ""}
+    except json.JSONDecodeError:  # a power cut; the checkpoint has its own digest
+        return {"state": "lost", "iteration": -1, "message": "status.json is damaged"}
     if status["state"] == "running" and time.time() - status["heartbeat"] > 6 * HEARTBEAT_SECONDS:
         status["state"] = "lost"
     return status
+
+
+def mark_lost(run: Run, message: str) -> None:
+    """Say in its status.json that the process that trained `run` is gone, unless another has taken the run over."""
+    with contextlib.suppress(Timeout), FileLock(run.folder / ".lock", timeout=0):
+        status = read_status(run.folder)
+        if status["state"] in ("running", "lost"):
+            write_atomically(run.folder / "status.json", json.dumps(status | {"state": "lost", "message": message}))
 
 
 def git(*arguments: str) -> str:
@@ -117,7 +129,7 @@ def manifest(run: Run) -> dict[str, Any]:
     """Where a run comes from: code, versions, machine, command. Holds no host name, user or environment."""
     lock = ROOT / "requirements.lock"
     difference = git("diff", "HEAD")
-    cpu = next((x for x in Path("/proc/cpuinfo").read_text().split("\n") if x.startswith("model name")), "")
+    cpu = dict(line.split("\t", 1) for line in Path("/proc/cpuinfo").read_text().splitlines() if "\t" in line)
     return {
         "schema": 1,
         "run_id": run.run_id,
@@ -129,7 +141,8 @@ def manifest(run: Run) -> dict[str, Any]:
         "lock": sha256(lock.read_bytes()).hexdigest() if lock.exists() else None,
         "python": platform.python_version(),
         "versions": {name: version(name) for name in ("torch", "mujoco", "gymnasium", "numpy", "scipy")},
-        "cpu": cpu.partition(":")[2].strip() or platform.processor(),
+        "cpu": cpu.get("model name", platform.processor()).strip("\t: "),
+        "cpu_flags": cpu.get("flags", "").strip("\t: "),
         "cpu_capability": torch.backends.cpu.get_cpu_capability(),
         "seed": {"root": run.seed, "streams": "SHA-256 of the purpose, then indices; see hippo/core/seeding.py"},
     }
@@ -153,9 +166,8 @@ def execute(run: Run) -> str:
 def _execute_locked(run: Run) -> str:
     if read_status(run.folder)["state"] == "finished":  # by whoever held the lock before
         return "finished"
-    _announce_resumption(run)
     write_atomically(run.folder / "config.yaml", run.to_yaml())
-    write_atomically(run.folder / "manifest.json", json.dumps(manifest(run), indent=1))
+    write_atomically(run.folder / "manifest.json", json.dumps(_manifest_with_history(run), indent=1))
     status = Status(run)
     status.update()
     with _preemption(), status.heartbeat():
@@ -167,19 +179,25 @@ def _execute_locked(run: Run) -> str:
             print(f"diverged: {error}", file=sys.stderr)
         except (Preempted, KeyboardInterrupt) as error:
             status.update(state="preempted", message=f"stopped by {error or 'Ctrl-C'}; start it again to continue")
+        except CheckpointError as error:
+            status.update(state="failed", message=str(error))
+            print(f"error: {error}", file=sys.stderr)
         except Exception as error:
             status.update(state="failed", message=f"{type(error).__name__}: {error}".splitlines()[0])
             traceback.print_exc()
     return status.content["state"]
 
 
-def _announce_resumption(run: Run) -> None:
-    path = run.folder / "manifest.json"
+def _manifest_with_history(run: Run) -> dict[str, Any]:
+    """The manifest; of a resumed run, with the commits of its earlier sessions, and a word about it on stdout."""
+    content, path = manifest(run), run.folder / "manifest.json"
     if not (run.folder / "checkpoint.pt").exists() or not path.exists():
-        return
-    before, now = json.loads(path.read_text())["git_commit"], git("rev-parse", "HEAD")
-    where = "" if before == now else f" under commit {now[:10] or 'unknown'}, begun under {before[:10] or 'unknown'}"
+        return content | {"earlier_commits": []}
+    before = json.loads(path.read_text())
+    old, new = before["git_commit"], content["git_commit"]
+    where = "" if old == new else f" under commit {new[:10] or 'unknown'}, last under {old[:10] or 'unknown'}"
     print(f"resuming {run.run_id}{where}", flush=True)
+    return content | {"earlier_commits": [*before["earlier_commits"], old]}
 
 
 @contextlib.contextmanager
@@ -246,12 +264,7 @@ def main(arguments: list[str] | None = None) -> int:
         run = compose_run(arguments)
     except ConfigError as error:
         return bad_input(error)
-    psutil.Process().nice(5)  # a training never makes the machine it runs on unusable
-    try:
-        return EXIT_CODES[execute(run)]
-    except CheckpointError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return EXIT_FAILED
+    return EXIT_CODES[execute(run)]
 
 
 if __name__ == "__main__":

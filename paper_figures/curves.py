@@ -34,11 +34,12 @@ def draw_panel(axes: Axes, results: Results, env: str, unit: float) -> dict[str,
         color = style.color_of(variant, list(variants))
         x = np.array(steps) / unit
         values = table.to_numpy().T  # (S, T)
+        marker = "." if len(x) < 4 else None  # so that a curve of one point is seen
         for curve in values:
-            axes.plot(x, curve, color=color, alpha=0.4, linewidth=0.8)
+            axes.plot(x, curve, color=color, alpha=0.3, linewidth=0.7, marker=marker, markersize=2)
         complete = ~np.isnan(values).any(0)  # the mean goes as far as every seed does
         interval = stats.bootstrap_mean(values[:, complete])
-        axes.plot(x[complete], interval.point, color=color)
+        axes.plot(x[complete], interval.point, color=color, marker=marker)
         axes.fill_between(x[complete], interval.low, interval.high, color=color, alpha=0.15, linewidth=0)
         seeds_drawn[variant] = len(seeds)
     return seeds_drawn
@@ -53,7 +54,7 @@ def caption(results: Results, seeds: dict[str, dict[str, int]]) -> str:
     lines = [
         f"{plan['title']}. Scale: {plan['scale']}.",
         f"Mean undiscounted return of the episodes that open an iteration, against environment steps. n = {n} seeds; "
-        "line: mean over seeds; thin lines: single seeds; no smoothing.",
+        "line: mean over seeds, as far as every seed goes; thin lines: single seeds; no smoothing.",
         f"Shaded: {stats.LEVEL:.0%} percentile bootstrap interval of the mean over seeds, {stats.RESAMPLES} resamples, "
         "pointwise. With fewer than about ten seeds it covers less than it says and decides nothing.",
         f"Physics: {physics}.",
@@ -92,10 +93,9 @@ def draw(results: Results, out: Path) -> list[Path]:
         axes.set_xlabel(f"{name} env. steps")
         if not seeds[env]:
             axes.text(0.5, 0.5, "not trained\nat this scale", transform=axes.transAxes, ha="center", va="center")
-            axes.set_xticks([])
-            axes.set_yticks([])
+            axes.set_axis_off()
             continue
-        axes.margins(x=0)
+        axes.set_xlim(left=0)
         n = seeds[env]
         different = ", ".join(f"{variants[v]}: {count}" for v, count in n.items())
         text = f"n = {min(n.values())}" if len(set(n.values())) == 1 else f"n: {different}"
@@ -127,7 +127,7 @@ def main(figure: str, arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     try:
         results = load(figure, options.scale, options.runs_dir, options.data)
-    except MissingData as error:
+    except (MissingData, ValueError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     for run in results.missing:

@@ -110,6 +110,13 @@ def test_a_torn_line_is_left_out_and_a_short_run_is_reported(tmp_path):
     assert np.isnan(runs.scores(results.frame, "block_hopper", "ppo")[2].to_numpy()[2, 1])
 
 
+def test_a_header_torn_by_a_kill_counts_as_nothing(tmp_path):
+    planned(tmp_path, [3, None])
+    (tmp_path / f"{1:012x}").mkdir()
+    (tmp_path / f"{1:012x}/progress.csv").write_text("iteration,env_st")
+    assert [r["seed"] for r in runs.load("fig3", "smoke", tmp_path, tmp_path).missing] == [1]
+
+
 def test_committed_rows_are_used_for_planned_runs_only(tmp_path):
     planned(tmp_path, [3, None])
     (tmp_path / "data/smoke").mkdir(parents=True)

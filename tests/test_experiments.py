@@ -93,6 +93,7 @@ WRONG = [
     (["algo.num_skills=2.5"], "algo.num_skills=2.5"),
     (["algo.skill_hidden_sizes=[64,a]"], "algo.skill_hidden_sizes"),
     (["wandb.mode=on"], "wandb.mode=on"),
+    (["runs_dir="], "runs_dir="),
     (["foo"], "foo"),
     (["+new=1"], "+new=1"),
     (["algo=ppo", "algo.num_skills=3"], "algo.num_skills=3: no such key"),
@@ -101,7 +102,7 @@ WRONG = [
 
 @pytest.mark.parametrize(("overrides", "message"), WRONG)
 def test_a_wrong_configuration_is_refused_in_one_line_and_nothing_is_written(overrides, message, tmp_path, capsys):
-    code = train.main([*overrides, f"runs_dir={tmp_path}/runs"])
+    code = train.main([f"runs_dir={tmp_path}/runs", *overrides])
     captured = capsys.readouterr()
     assert code == 2
     assert message in captured.err

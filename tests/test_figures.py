@@ -39,6 +39,12 @@ def test_a_figure_is_drawn_with_its_numbers_and_its_caption(tmp_path, capsys):
     assert f"{0:012x}".encode() in (folder / "fig3.png").read_bytes()  # provenance
 
 
+def test_a_run_that_never_started_is_named_and_the_rest_is_drawn(tmp_path):
+    planned(tmp_path, [3, None])
+    assert draw(tmp_path) == 0
+    assert "n = 1 seeds" in (tmp_path / "out/smoke/fig3.caption.txt").read_text()
+
+
 def test_a_figure_drawn_twice_is_the_same_file(tmp_path):
     planned(tmp_path, [3, 3])
     draw(tmp_path, "a")
@@ -51,6 +57,12 @@ def test_without_data_there_is_a_message_and_no_empty_figure(tmp_path, capsys):
     assert draw(tmp_path) == 2
     assert capsys.readouterr().err.startswith("error: fig3: no plan at scale smoke")
     assert not (tmp_path / "out").exists()
+
+
+def test_two_kinds_of_physics_end_in_one_line(tmp_path, capsys):
+    planned(tmp_path, [3, 3], physics=("paper", "fast"))
+    assert draw(tmp_path) == 2
+    assert "mixes two kinds of physics" in capsys.readouterr().err
 
 
 def test_a_method_has_one_colour_and_no_two_methods_share_one():
