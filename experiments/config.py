@@ -286,8 +286,6 @@ def _validated(config: DictConfig, algo: str) -> Run:
     check_choice("wandb.mode", plain["wandb"]["mode"], WANDB_MODES)
     if not plain["runs_dir"]:
         raise ConfigError("runs_dir", "", "must name a folder")
-    if not plain["runs_dir"]:
-        raise ConfigError("runs_dir", "", "must name a folder")
     if not 0 <= plain["seed"] < 2**32:
         raise ConfigError("seed", plain["seed"], "must be at least 0 and below 2**32")
     return Run(

@@ -13,13 +13,18 @@ code exponentiates first).
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from hippo.core.hierarchy import Batch, HierarchicalPolicy, levels
+from hippo.core import seeding
+from hippo.core.advantages import Baselines, advantages
+from hippo.core.checkpoint import Checkpoint
+from hippo.core.gae import gae
+from hippo.core.hierarchy import Batch, HierarchicalPolicy, HierarchyConfig, collect, levels
 from hippo.core.policies import gaussian_log_prob
 from hippo.core.ppo import CHUNK, chunks
 
@@ -260,3 +265,62 @@ def gradient_variance(policy: HierarchicalPolicy, batch: Batch, skill_advantage:
         gradients.append(flat_gradient(policy.skills))
     policy.skills.zero_grad(set_to_none=True)
     return float(torch.stack(gradients).var(0).sum())
+
+
+def restore(config: HierarchyConfig, envs: Any, checkpoint: Checkpoint) -> tuple[HierarchicalPolicy, Baselines, int]:
+    """Policy and baselines as a trained run left them, and the iteration that would come next."""
+    obs_size, action_size = envs.single_observation_space.shape[0], envs.single_action_space.shape[0]
+    generator = seeding.torch_generator(0, "overwritten by the checkpoint")
+    policy = HierarchicalPolicy(config, obs_size, envs.robot_size, action_size, generator)
+    baselines = Baselines(config, obs_size, generator)
+    return policy, baselines, checkpoint.restore(policy=policy, baselines=baselines)
+
+
+def measure(
+    config: HierarchyConfig, make_envs: Callable[[int, str], Any], seed: int, checkpoint: Checkpoint
+) -> dict[str, float]:
+    """Table 2's quantities on the batch of the next iteration, under the policy that collects it, before its update.
+
+    Args: as `hippo.hippo.train`; the checkpoint is that of a run of ten iterations for the paper's iteration 10.
+
+    Returns:
+        `cosine_similarities` and `skill_separation`, and `iteration`.
+    """
+    envs = make_envs(config.num_envs, "training")
+    policy, baselines, iteration = restore(config, envs, checkpoint)
+    batch = collect(policy, envs, config, seed, iteration)
+    estimate = advantages(batch, baselines, config)
+    envs.close()
+    return {
+        "iteration": iteration,
+        **cosine_similarities(policy, batch, estimate.manager, estimate.skills),
+        **skill_separation(policy, batch),
+    }
+
+
+def baseline_variances(
+    config: HierarchyConfig, make_envs: Callable[[int, str], Any], seed: int, checkpoint: Checkpoint
+) -> dict[str, float]:
+    """`gradient_variance` of one policy with no, the single and the skill-conditioned baseline (section 4.2).
+
+    Both baselines are fitted to one batch of the policy and used on the next, as in training, but until the fit
+    converges, so that what differs is what they see.
+    """
+    envs = make_envs(config.num_envs, "training")
+    policy, baselines, iteration = restore(config, envs, checkpoint)
+    fitting, batch = (collect(policy, envs, config, seed, iteration + i) for i in (0, 1))
+    envs.close()
+    baselines.evaluations = 200
+    returns = step_returns(fitting, config)
+    baselines.fit(fitting, {"single": returns, "skill": returns})
+    result = {}
+    for kind in ("none", "single", "skill"):
+        value = baselines.predict(kind, batch.steps.obs, batch.time_left, batch.skill)[:-1]
+        result[kind] = gradient_variance(policy, batch, step_returns(batch, config) - value)
+    return result
+
+
+def step_returns(batch: Batch, config: HierarchyConfig) -> Tensor:
+    """(T, N) discounted return from every step to the end of its episode or of the batch."""
+    steps, zero = batch.steps, torch.zeros_like(batch.steps.reward)
+    return gae(steps.reward, zero, zero, steps.terminated, steps.done, config.gamma, 1.0)

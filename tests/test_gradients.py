@@ -6,10 +6,11 @@ import math
 import pytest
 import torch
 
-from hippo import gradients
+from hippo import gradients, hippo
+from hippo.core.checkpoint import Checkpoint
 from hippo.core.hierarchy import HierarchicalPolicy, collect
 from hippo.hippo import HippoConfig
-from tests.toy import TargetEnv
+from tests.toy import TargetEnv, run
 
 
 def hierarchy(num_skills=3, horizon=12, num_envs=4, death_rate=0.1, spread=1.0, size=2, **settings):
@@ -224,3 +225,19 @@ def test_gradient_variance_is_that_of_the_trajectories_estimates_and_a_good_base
         estimates.append(gradients.flat_gradient(policy.skills))
     assert raw == pytest.approx(float(torch.stack(estimates).var(0).sum()), rel=1e-9)
     assert gradients.gradient_variance(policy, batch, togo - togo.mean(1, keepdim=True)) < 0.7 * raw
+
+
+def test_a_trained_run_is_measured_on_its_next_batch_before_any_update(tmp_path):
+    config = HippoConfig(iterations=2, batch_size=200, horizon=20, num_skills=3, period_min=5, period_max=5)
+    run(hippo.train, config, tmp_path)
+    before = (tmp_path / "checkpoint.pt").read_bytes()
+    make_envs = lambda num_envs, purpose: TargetEnv(num_envs, 0)  # noqa: E731
+    first = gradients.measure(config, make_envs, 0, Checkpoint(tmp_path))
+    assert first == gradients.measure(config, make_envs, 0, Checkpoint(tmp_path))
+    assert (tmp_path / "checkpoint.pt").read_bytes() == before
+    assert first["iteration"] == 2
+    assert -1 <= first["cosine_batch"] <= 1
+    assert first["trajectories"] == 10
+    variances = gradients.baseline_variances(config, make_envs, 0, Checkpoint(tmp_path))
+    assert set(variances) == {"none", "single", "skill"}
+    assert variances["single"] < variances["none"]
