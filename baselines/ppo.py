@@ -93,9 +93,16 @@ class PPOConfig:
 
 @torch.no_grad()
 def collect(
-    policy: GaussianPolicy, envs: gym.vector.VectorEnv, config: PPOConfig, seed: int, iteration: int
+    policy: GaussianPolicy,
+    envs: gym.vector.VectorEnv,
+    config: PPOConfig,
+    seed: int,
+    iteration: int,
+    greedy: bool = False,
 ) -> tuple[Steps, Tensor]:
     """Run every environment for one horizon from a fresh episode; all randomness is named by (seed, iteration).
+
+    With `greedy` the policy takes its mean action.
 
     Returns:
         What happened, and (T, N) bool where an action was chosen rather than held.
@@ -103,6 +110,7 @@ def collect(
     T, N = config.horizon, envs.num_envs
     steps = Steps(envs, T, config.bootstrap_horizon)
     noise = torch.randn(steps.action.shape, generator=seeding.torch_generator(seed, "policy", iteration))
+    noise *= not greedy
     is_decision = torch.empty(T, N, dtype=torch.bool)
     action = torch.empty(N, steps.action.shape[-1])
     steps_left = torch.zeros(N, dtype=torch.long)
@@ -118,6 +126,17 @@ def collect(
         steps_left -= 1
         steps_left[done] = 0
     return steps, is_decision
+
+
+def rollout(
+    config: PPOConfig, envs: gym.vector.VectorEnv, seed: int, checkpoint: Checkpoint, greedy: bool = False
+) -> Steps:
+    """One horizon in every environment with the policy of a checkpoint; nothing is learnt."""
+    obs_size, action_size = envs.single_observation_space.shape[0], envs.single_action_space.shape[0]  # type: ignore[index]
+    generator = seeding.torch_generator(0, "overwritten by the checkpoint")
+    policy = GaussianPolicy(obs_size, action_size, config.hidden_sizes, generator)
+    checkpoint.restore(policy=policy)
+    return collect(policy, envs, config, seed, 0, greedy)[0]
 
 
 def train(config: PPOConfig, make_envs: MakeEnvs, log: RunLog, seed: int, checkpoint: Checkpoint) -> None:

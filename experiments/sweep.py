@@ -204,7 +204,8 @@ def run_figure(plan: Plan, workers: int, runs_dir: Path) -> int:
         entry.state = states.get(entry.run.run_id, entry.state)
     plan.write(runs_dir)
     if todo:
-        print(f"{'\r' if terminal else ''}[{len(todo)}/{len(todo)}] done in {clock(time.monotonic() - started)}")
+        start_of_line = "\r" if terminal else ""
+        print(f"{start_of_line}[{len(todo)}/{len(todo)}] done in {clock(time.monotonic() - started)}")
     bad = {e.run.run_id: e for e in plan.entries if e.state not in DONE}
     for e in bad.values():
         message = read_status(e.run.folder).get("message", "")

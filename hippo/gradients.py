@@ -24,7 +24,7 @@ from hippo.core import seeding
 from hippo.core.advantages import Baselines, advantages
 from hippo.core.checkpoint import Checkpoint
 from hippo.core.gae import gae
-from hippo.core.hierarchy import Batch, HierarchicalPolicy, HierarchyConfig, collect, levels
+from hippo.core.hierarchy import Batch, HierarchicalPolicy, HierarchyConfig, collect, levels, restored_policy
 from hippo.core.policies import gaussian_log_prob
 from hippo.core.ppo import CHUNK, chunks
 
@@ -267,13 +267,11 @@ def gradient_variance(policy: HierarchicalPolicy, batch: Batch, skill_advantage:
     return float(torch.stack(gradients).var(0).sum())
 
 
-def restore(config: HierarchyConfig, envs: Any, checkpoint: Checkpoint) -> tuple[HierarchicalPolicy, Baselines, int]:
-    """Policy and baselines as a trained run left them, and the iteration that would come next."""
-    obs_size, action_size = envs.single_observation_space.shape[0], envs.single_action_space.shape[0]
+def restored_baselines(config: HierarchyConfig, envs: Any, checkpoint: Checkpoint) -> tuple[Baselines, int]:
+    """Baselines as a trained run left them, and the iteration that would come next."""
     generator = seeding.torch_generator(0, "overwritten by the checkpoint")
-    policy = HierarchicalPolicy(config, obs_size, envs.robot_size, action_size, generator)
-    baselines = Baselines(config, obs_size, generator)
-    return policy, baselines, checkpoint.restore(policy=policy, baselines=baselines)
+    baselines = Baselines(config, envs.single_observation_space.shape[0], generator)
+    return baselines, checkpoint.restore(baselines=baselines)
 
 
 def measure(
@@ -287,7 +285,8 @@ def measure(
         `cosine_similarities` and `skill_separation`, and `iteration`.
     """
     envs = make_envs(config.num_envs, "training")
-    policy, baselines, iteration = restore(config, envs, checkpoint)
+    policy = restored_policy(config, envs, checkpoint)
+    baselines, iteration = restored_baselines(config, envs, checkpoint)
     batch = collect(policy, envs, config, seed, iteration)
     estimate = advantages(batch, baselines, config)
     envs.close()
@@ -307,7 +306,8 @@ def baseline_variances(
     converges, so that what differs is what they see.
     """
     envs = make_envs(config.num_envs, "training")
-    policy, baselines, iteration = restore(config, envs, checkpoint)
+    policy = restored_policy(config, envs, checkpoint)
+    baselines, iteration = restored_baselines(config, envs, checkpoint)
     fitting, batch = (collect(policy, envs, config, seed, iteration + i) for i in (0, 1))
     envs.close()
     baselines.evaluations = 200

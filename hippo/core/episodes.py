@@ -45,3 +45,16 @@ def episode_statistics(reward: np.ndarray, done: np.ndarray) -> dict[str, float 
         "return_mean_all": float(np.mean(everything)),
         "episodes": len(everything),
     }
+
+
+def opening_episodes(reward: np.ndarray, done: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Undiscounted returns (N,) and lengths (N,) of the first episode in every column of a (T, N) batch.
+
+    Raises:
+        ValueError: an episode is not over by the end of the batch.
+    """
+    if not done.any(0).all():
+        raise ValueError("an opening episode is not over by the end of the batch")
+    length = done.argmax(0) + 1
+    inside = np.arange(len(reward))[:, None] < length
+    return (reward * inside).sum(0), length

@@ -6,12 +6,14 @@ HiPPO, HierVPG and MLSH train this same hierarchy and differ in what they do wit
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import gymnasium as gym
 import torch
 from torch import Tensor, nn
 
 from hippo.core import seeding
+from hippo.core.checkpoint import Checkpoint
 from hippo.core.policies import Manager, SkillPolicy, gaussian_entropy, sample_categorical
 from hippo.core.ppo import Level
 from hippo.core.rollout import Steps
@@ -164,11 +166,12 @@ class Commitment:
         self.steps_left = torch.zeros(num_envs, dtype=torch.long)  # (N,)
 
     def renew(
-        self, policy: HierarchicalPolicy, obs: Tensor, period: Tensor, period_max: int, uniform: Tensor
+        self, policy: HierarchicalPolicy, obs: Tensor, period: Tensor, period_max: int, uniform: Tensor | None
     ) -> Tensor:
         """Where a commitment has run out take the new `period` (N,), then let the manager choose.
 
-        The period is drawn before the manager acts, so that the manager knows how long its choice will last.
+        The period is drawn before the manager acts, so that the manager knows how long its choice will last. Without
+        `uniform` (N,) the manager takes its most likely skill.
 
         Returns:
             (N,) bool, where a decision was made.
@@ -179,7 +182,7 @@ class Commitment:
             self.steps_left[where] = period[where]
             time_left = self.steps_left[where] / period_max
             logits = policy.manager.logits(policy.manager_input(obs[where], time_left))
-            self.skill[where] = sample_categorical(logits, uniform[where])
+            self.skill[where] = logits.argmax(-1) if uniform is None else sample_categorical(logits, uniform[where])
         return is_decision
 
     def advance(self, done: Tensor) -> None:
@@ -201,12 +204,18 @@ class Batch:
 
 @torch.no_grad()
 def collect(
-    policy: HierarchicalPolicy, envs: gym.vector.VectorEnv, config: HierarchyConfig, seed: int, iteration: int
+    policy: HierarchicalPolicy,
+    envs: gym.vector.VectorEnv,
+    config: HierarchyConfig,
+    seed: int,
+    iteration: int,
+    greedy: bool = False,
 ) -> Batch:
     """Algorithm 1 in every environment, for one horizon from a fresh episode.
 
-    All randomness is drawn up front from streams named by (seed, iteration): periods, the manager's uniforms and the
-    skills' Gaussian noise, so what one level draws never shifts what the other draws.
+    With `greedy` both levels take their most likely choice. All randomness is drawn up front from streams named by
+    (seed, iteration): periods, the manager's uniforms and the skills' Gaussian noise, so what one level draws never
+    shifts what the other draws.
     """
     T, N = config.horizon, envs.num_envs
     steps = Steps(envs, T, config.bootstrap_horizon)
@@ -214,6 +223,7 @@ def collect(
     period = torch.randint(config.period_min, config.period_max + 1, (T + 1, N), generator=generator)
     uniform = torch.rand(T + 1, N, generator=seeding.torch_generator(seed, "manager", iteration))
     noise = torch.randn(steps.action.shape, generator=seeding.torch_generator(seed, "skills", iteration))
+    noise *= not greedy
     skill = torch.empty(T + 1, N, dtype=torch.long)
     time_left = torch.empty(T + 1, N)
     is_decision = torch.empty(T + 1, N, dtype=torch.bool)
@@ -222,7 +232,8 @@ def collect(
     steps.reset(seeding.integer(seed, "episodes", iteration))
     for t in range(T + 1):
         obs = steps.obs[t]
-        is_decision[t] = commitment.renew(policy, obs, period[t], config.period_max, uniform[t])
+        chance = None if greedy else uniform[t]
+        is_decision[t] = commitment.renew(policy, obs, period[t], config.period_max, chance)
         skill[t] = commitment.skill
         time_left[t] = commitment.steps_left / config.period_max
         if t < T:
@@ -233,6 +244,22 @@ def collect(
     if config.truncate_to_period:
         used = in_whole_periods(is_decision[:T], config.period_max)
     return Batch(steps, skill, time_left, is_decision, used)
+
+
+def rollout(
+    config: HierarchyConfig, envs: gym.vector.VectorEnv, seed: int, checkpoint: Checkpoint, greedy: bool = False
+) -> Steps:
+    """One horizon in every environment with the policy of a checkpoint; nothing is learnt."""
+    return collect(restored_policy(config, envs, checkpoint), envs, config, seed, 0, greedy).steps
+
+
+def restored_policy(config: HierarchyConfig, envs: Any, checkpoint: Checkpoint) -> HierarchicalPolicy:
+    """The policy of a checkpoint."""
+    obs_size, action_size = envs.single_observation_space.shape[0], envs.single_action_space.shape[0]
+    generator = seeding.torch_generator(0, "overwritten by the checkpoint")
+    policy = HierarchicalPolicy(config, obs_size, envs.robot_size, action_size, generator)
+    checkpoint.restore(policy=policy)
+    return policy
 
 
 def in_whole_periods(is_decision: Tensor, period: int) -> Tensor:

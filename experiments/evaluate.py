@@ -1,0 +1,120 @@
+"""Evaluate a trained policy, also under changed dynamics, without learning: a csv with a row per episode.
+
+    python -m experiments.evaluate runs/<run_id> --perturbation mass --episodes 25 --out mass.csv
+
+The same seed gives the same episodes (object positions, wall heights, initial poses, action noise) in the original
+and in every changed environment, so that what differs is the dynamics. Training's random streams are never touched.
+"""
+
+import argparse
+import csv
+import io
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from experiments.config import Run, algorithm
+from experiments.train import bad_input, write_atomically
+from hippo.core import seeding
+from hippo.core.checkpoint import Checkpoint, CheckpointError
+from hippo.core.episodes import opening_episodes
+from hippo.core.settings import ConfigError
+from hippo.envs import make
+
+COLUMNS = (
+    "run_id",
+    "algo",
+    "env",
+    "perturbation",
+    "strength",
+    "greedy",
+    "seed",
+    "episode",
+    "return",
+    "length",
+    "diverged",
+)
+
+
+def evaluate(run: Run, episodes: int, seed: int, greedy: bool = False, **changes: Any) -> list[dict[str, Any]]:
+    """One row of COLUMNS per episode of the policy in `run`'s folder.
+
+    Args:
+        episodes: how many, all simulated side by side. seed: of the evaluation, apart from the run's.
+        changes: options of the environment that differ from the run's, e.g. perturbation="mass".
+
+    Raises:
+        ConfigError: there is nothing trained, or no such option.
+    """
+    if not (run.folder / "checkpoint.pt").exists():
+        raise ConfigError("run", run.folder, "has no checkpoint; train it first")
+    options = run.options | {name: value for name, value in changes.items() if value is not None}
+    try:
+        envs = make(run.env, episodes, seeding.integer(seed, "evaluation"), horizon=run.config.horizon, **options)
+    except ValueError as error:
+        setting, _, valid = str(error).partition(": ")
+        key, _, value = setting.partition("=")
+        raise ConfigError(key, value, valid) from error
+    streams = seeding.integer(seed, "evaluation of a policy")
+    steps = algorithm(run.algo).rollout(run.config, envs, streams, Checkpoint(run.folder), greedy)
+    returns, lengths = opening_episodes(steps.reward.numpy(), steps.done.numpy())
+    common = {
+        "run_id": run.run_id,
+        "algo": run.algo,
+        "env": run.env,
+        "perturbation": options.get("perturbation") or "none",
+        "strength": options.get("strength", "original"),
+        "greedy": greedy,
+        "seed": seed,
+        "diverged": steps.diverged,
+    }
+    return [
+        common | {"episode": i, "return": float(r), "length": int(n)}
+        for i, (r, n) in enumerate(zip(returns, lengths, strict=True))
+    ]
+
+
+def as_csv(rows: Sequence[dict[str, Any]]) -> str:
+    """Rows of `evaluate` as csv text."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Evaluate from the command line."""
+    parser = argparse.ArgumentParser(prog="experiments.evaluate", description=__doc__.splitlines()[0])
+    parser.add_argument("run", type=Path, help="a run folder")
+    parser.add_argument("--perturbation", help="mass, damping, inertia or friction")
+    parser.add_argument("--strength", help="original (default) or all")
+    parser.add_argument("--episodes", type=int, default=25, help="the paper's 25 (Table 1)")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--greedy", action="store_true", help="most likely choices instead of samples")
+    parser.add_argument("--out", type=Path, help="csv to write instead of printing it")
+    options = parser.parse_args(arguments)
+    torch.set_num_threads(1)
+    try:
+        if not (options.run / "config.yaml").exists():
+            raise ConfigError("run", options.run, "is no run folder: it has no config.yaml")
+        run = Run.from_yaml((options.run / "config.yaml").read_text(), options.run.parent)
+        changes = {"perturbation": options.perturbation, "strength": options.strength}
+        rows = evaluate(run, options.episodes, options.seed, options.greedy, **changes)
+    except (ConfigError, CheckpointError) as error:
+        return bad_input(error)
+    returns = np.array([row["return"] for row in rows])
+    if options.out is None:
+        print(as_csv(rows), end="")
+    else:
+        write_atomically(options.out, as_csv(rows))
+        print(f"{len(rows)} episodes, mean return {returns.mean():.3f}, std {returns.std():.3f}: {options.out}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

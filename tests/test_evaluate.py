@@ -1,0 +1,100 @@
+"""Evaluation: repeatable, side by side under changed dynamics, apart from training's randomness."""
+
+import csv
+
+import numpy as np
+import pytest
+import torch
+
+from baselines import ppo
+from experiments import evaluate, train
+from experiments.config import compose_run
+from hippo.core.episodes import opening_episodes
+from hippo.core.hierarchy import HierarchicalPolicy, collect
+from hippo.core.policies import GaussianPolicy
+from hippo.hippo import HippoConfig
+from tests.toy import TargetEnv
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("runs")
+    runs = {}
+    for algo in ("hippo", "ppo", "hier_vpg"):
+        budget = ["iterations=1", "batch_size=400", "env.horizon=40", f"runs_dir={folder}"]
+        runs[algo] = compose_run(["env=snake_gather", f"algo={algo}", "scale=smoke", *budget])
+        assert train.execute(runs[algo]) == "finished"
+    return runs
+
+
+def returns(rows):
+    return [row["return"] for row in rows]
+
+
+def test_opening_episodes_worked_by_hand():
+    reward = np.array([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]])
+    done = np.array([[False, True], [False, False], [True, True]])
+    total, length = opening_episodes(reward, done)
+    assert (total.tolist(), length.tolist()) == ([9.0, 2.0], [3, 1])
+    with pytest.raises(ValueError, match="not over"):
+        opening_episodes(reward, np.zeros((3, 2), bool))
+
+
+@pytest.mark.parametrize("algo", ["hippo", "ppo", "hier_vpg"])
+def test_evaluation_repeats_itself_and_leaves_the_run_alone(algo, trained):
+    run = trained[algo]
+    before = {p.name: p.read_bytes() for p in run.folder.iterdir()}
+    first = evaluate.evaluate(run, 6, seed=0)
+    assert first == evaluate.evaluate(run, 6, seed=0)
+    assert {p.name: p.read_bytes() for p in run.folder.iterdir()} == before
+    assert len(first) == 6
+    assert {row["length"] for row in first} == {40}
+
+
+def test_changed_dynamics_meet_the_same_episodes(trained):
+    # Damping and friction cannot change the Snake, so the very same returns prove the same episodes and noise.
+    run = trained["hippo"]
+    lengths = []
+    for perturbation in (None, "damping", "friction"):
+        rows = evaluate.evaluate(run, 8, seed=3, perturbation=perturbation)
+        lengths.append((returns(rows), rows[0]["perturbation"]))
+    assert lengths[0][0] == lengths[1][0] == lengths[2][0]
+    assert [name for _, name in lengths] == ["none", "damping", "friction"]
+
+
+def test_greedy_rollouts_take_the_most_likely_choices():
+    config = HippoConfig(iterations=1, batch_size=200, horizon=20)
+    policy = HierarchicalPolicy(config, 2, 2, 2, torch.Generator().manual_seed(0))
+    batch = collect(policy, TargetEnv(10, 0), config, 0, 0, greedy=True)
+    obs, skill, time_left = batch.steps.obs[:-1], batch.skill[:-1], batch.time_left[:-1]
+    decided = batch.is_decision[:-1]
+    best = policy.manager.logits(policy.manager_input(obs, time_left)).argmax(-1)
+    assert torch.equal(skill[decided], best[decided])
+    rows = policy.skill_input(obs, time_left).flatten(0, 1)
+    mean = policy.skills.means(rows)[torch.arange(200), skill.flatten()]
+    torch.testing.assert_close(batch.steps.action.flatten(0, 1), mean)
+    noisy = collect(policy, TargetEnv(10, 0), config, 0, 0)
+    assert not torch.equal(noisy.skill, batch.skill)
+    assert (noisy.steps.action - batch.steps.action).abs().mean() > 0.5
+
+    flat_config = ppo.PPOConfig(iterations=1, batch_size=200, horizon=20)
+    flat = GaussianPolicy(2, 2, [8], torch.Generator().manual_seed(0))
+    steps, _ = ppo.collect(flat, TargetEnv(10, 0), flat_config, 0, 0, greedy=True)
+    torch.testing.assert_close(steps.action, flat.mean(steps.obs[:-1]))
+
+
+def test_the_command_line_writes_a_csv_or_refuses(trained, tmp_path, capsys):
+    run, out = trained["ppo"], tmp_path / "mass.csv"
+    assert evaluate.main([str(run.folder), "--perturbation", "mass", "--episodes", "3", "--out", str(out)]) == 0
+    rows = list(csv.DictReader(out.open()))
+    assert [row["perturbation"] for row in rows] == ["mass"] * 3
+    assert {row["run_id"] for row in rows} == {run.run_id}
+    capsys.readouterr()
+    for arguments, message in (
+        ([str(tmp_path)], "is no run folder"),
+        ([str(run.folder), "--perturbation", "wind"], "perturbation=wind"),
+        ([str(run.folder), "--episodes", "0"], "num_envs=0"),
+    ):
+        assert evaluate.main([*arguments, "--out", str(tmp_path / "no.csv")]) == 2
+        assert message in capsys.readouterr().err
+        assert not (tmp_path / "no.csv").exists()
