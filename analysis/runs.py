@@ -28,8 +28,13 @@ class Results:
     missing: list[dict[str, Any]]  # planned runs without a single row, or cut short, as they stand in the plan
 
 
-def load(figure: str, scale: str, runs_dir: Path, data_dir: Path, metrics: Sequence[str] = ("return_mean",)) -> Results:
+def load(
+    figure: str, scale: str, runs_dir: Path, data_dir: Path, metrics: Sequence[str] | None = ("return_mean",)
+) -> Results:
     """Read every run of a figure; rows of a run folder win over committed rows of the same run.
+
+    Args:
+        metrics: columns of progress.csv to read, None for all.
 
     Raises:
         MissingData: no plan, or not one row.
@@ -45,7 +50,8 @@ def load(figure: str, scale: str, runs_dir: Path, data_dir: Path, metrics: Seque
         rows = read_progress(runs_dir / run["run_id"] / "progress.csv", metrics)
         if rows.empty:
             rows = committed.loc[committed["run_id"] == run["run_id"], ["env_steps", "metric", "value"]]
-        if rows.empty or rows.groupby("metric").size().min() < run["iterations"]:
+        expected = run["iterations"] if run["kind"] == "train" else 1
+        if rows.empty or rows.groupby("metric").size().min() < expected:
             missing.append(run)
         if not rows.empty:  # an empty part would turn numbers into objects
             labels = {key: run[key] for key in ("env", "variant", "seed", "run_id")}
@@ -59,7 +65,7 @@ def load(figure: str, scale: str, runs_dir: Path, data_dir: Path, metrics: Seque
     return Results(plan, frame, missing)
 
 
-def read_progress(path: Path, metrics: Sequence[str]) -> pd.DataFrame:
+def read_progress(path: Path, metrics: Sequence[str] | None) -> pd.DataFrame:
     """env_steps, metric, value of one run's progress.csv; a last line torn by a kill is left out."""
     if not path.exists():
         return pd.DataFrame(columns=["env_steps", "metric", "value"])
@@ -68,7 +74,8 @@ def read_progress(path: Path, metrics: Sequence[str]) -> pd.DataFrame:
     if not whole:
         return pd.DataFrame(columns=["env_steps", "metric", "value"])
     table = pd.read_csv(io.StringIO(whole))
-    return table.melt(id_vars="env_steps", value_vars=list(metrics), var_name="metric")
+    columns = [c for c in table.columns if c not in ("iteration", "env_steps")] if metrics is None else list(metrics)
+    return table.melt(id_vars="env_steps", value_vars=columns, var_name="metric")
 
 
 def read_committed(path: Path) -> pd.DataFrame:

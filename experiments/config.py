@@ -38,6 +38,8 @@ BUDGET_FIELDS = ("iterations", "batch_size", "horizon")
 NOT_OVERRIDDEN = {"budget", "seeds", "scale", "env.name", "env.label", "env.seconds_per_step"} | {
     f"algo.{name}" for name in BUDGET_FIELDS
 }
+KINDS = ("train", "measure")
+MEASURE_REVISION = 1  # bumped when what hippo.gradients.measure computes changes
 WANDB_MODES = ("disabled", "offline", "online")
 
 
@@ -97,6 +99,12 @@ class Run:
     runs_dir: Path
     wandb_mode: str
     seconds_per_step: float
+    kind: str = "train"  # or "measure": Table 2's quantities of the trained run with the same settings
+
+    @property
+    def parent(self) -> "Run | None":
+        """The run that must be finished before this one can start."""
+        return None if self.kind == "train" else dataclasses.replace(self, kind="train")
 
     @functools.cached_property
     def identity(self) -> dict[str, Any]:
@@ -116,7 +124,7 @@ class Run:
             **{name: getattr(self.config, name) for name in BUDGET_FIELDS},
             "seed": self.seed,
             "mujoco": version("mujoco"),
-        }
+        } | ({} if self.kind == "train" else {"kind": self.kind, "measure_revision": MEASURE_REVISION})
 
     @functools.cached_property
     def run_id(self) -> str:

@@ -7,6 +7,7 @@ python -m experiments.sweep status fig3 --scale smoke
 
 import argparse
 import csv
+import dataclasses
 import json
 import os
 import signal
@@ -76,7 +77,7 @@ class Plan:
                     "iterations": e.run.config.iterations,
                     "batch_size": e.run.config.batch_size,
                     "physics": e.run.options.get("physics", "paper"),
-                    "kind": "train",
+                    "kind": e.run.kind,
                     "state": e.state,
                 }
                 for e in self.entries
@@ -119,11 +120,14 @@ def make_plan(figure: str, scale: str, settings: Sequence[str], fresh: bool, run
             chosen = [f"env={env}", f"algo={what['algo']}", f"scale={scale}", f"runs_dir={runs_dir}"]
             for seed in range(seeds):
                 run = compose_run([*chosen, *what.get("settings", []), *settings, f"seed={seed}"])
+                run = dataclasses.replace(run, kind=description.get("kind", "train"))
                 state = read_status(run.folder)["state"]
                 if state != "finished" and run.run_id in committed:
                     state = "committed"
                 entries.append(Entry(run, label, variant, what["label"], state))
-    return Plan(figure, scale, description["title"], description["claims"], description.get("notes", []), entries)
+    return Plan(
+        figure, scale, description["title"], description.get("claims", []), description.get("notes", []), entries
+    )
 
 
 def summary(plan: Plan) -> str:

@@ -18,7 +18,7 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from hashlib import sha256
 from importlib.metadata import version
 from pathlib import Path
@@ -28,7 +28,8 @@ import torch
 from filelock import FileLock, Timeout
 
 from experiments.config import Run, algorithm, compose_run
-from hippo.core import seeding
+from hippo import gradients
+from hippo.core import checkpoint, seeding
 from hippo.core.checkpoint import Checkpoint, CheckpointError
 from hippo.core.log import Diverged, Row, RunLog
 from hippo.core.settings import ConfigError
@@ -153,6 +154,8 @@ def execute(run: Run) -> str:
     if read_status(run.folder)["state"] == "finished":
         print(f"{run.run_id} is finished: {run.folder}")
         return "finished"
+    if run.parent is not None and not _finish_parent(run.parent):
+        return "failed"
     run.folder.mkdir(parents=True, exist_ok=True)
     try:
         with FileLock(run.folder / ".lock", timeout=0):
@@ -161,6 +164,15 @@ def execute(run: Run) -> str:
         status = read_status(run.folder)
         print(f"{run.run_id} is already running (host {status.get('host')}, pid {status.get('pid')})")
         return "running"
+
+
+def _finish_parent(parent: Run) -> bool:
+    """Train what a run depends on, or wait for whoever does; whether it is finished."""
+    while (state := execute(parent)) == "running":
+        time.sleep(HEARTBEAT_SECONDS)
+    if state != "finished":
+        print(f"{parent.run_id}, which this run depends on, is {state}: {parent.folder}", file=sys.stderr)
+    return state == "finished"
 
 
 def _execute_locked(run: Run) -> str:
@@ -172,9 +184,10 @@ def _execute_locked(run: Run) -> str:
     status.update()
     with _preemption(), status.heartbeat():
         try:
-            train(run, status)
+            WORK[run.kind](run, status)
             status.update(state="finished", message="")
         except Diverged as error:
+            checkpoint.save(run.folder / "diverged.pt", error.dump)
             status.update(state="diverged", message=str(error))
             print(f"diverged: {error}", file=sys.stderr)
         except (Preempted, KeyboardInterrupt) as error:
@@ -215,15 +228,22 @@ def _preemption() -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def train(run: Run, status: Status) -> None:
-    """Hand the run to its algorithm."""
+def prepare(run: Run) -> Callable[[int, str], Any]:
+    """Set torch up and return what makes the run's environments, each purpose with its own random stream."""
     torch.set_num_threads(1)
     torch.use_deterministic_algorithms(True)
-    started, first = time.monotonic(), None
 
     def make_envs(num_envs: int, purpose: str) -> Any:
         seed = seeding.integer(run.seed, "environments", *purpose.encode())
         return make(run.env, num_envs, seed, horizon=run.config.horizon, **run.options)
+
+    return make_envs
+
+
+def train(run: Run, status: Status) -> None:
+    """Hand the run to its algorithm."""
+    make_envs = prepare(run)
+    started, first = time.monotonic(), None
 
     def on_row(metrics: Row, timing: Row) -> None:
         nonlocal first
@@ -238,8 +258,21 @@ def train(run: Run, status: Status) -> None:
         )
         status.update(iteration=done - 1, env_steps=metrics["env_steps"], steps_per_second=speed)
 
-    log, checkpoint = RunLog(run.folder, on_row), Checkpoint(run.folder)
-    algorithm(run.algo).train(run.config, make_envs, log, run.seed, checkpoint)
+    algorithm(run.algo).train(run.config, make_envs, RunLog(run.folder, on_row), run.seed, Checkpoint(run.folder))
+
+
+def measure(run: Run, status: Status) -> None:
+    """Table 2's quantities of the parent run, as the single row of progress.csv."""
+    assert run.parent is not None
+    make_envs, start = prepare(run), time.perf_counter()
+    metrics = gradients.measure(run.config, make_envs, run.seed, Checkpoint(run.parent.folder))
+    log = RunLog(run.folder)
+    log.resume(0)
+    log.row(metrics, {"seconds": time.perf_counter() - start})
+    status.update(iteration=run.config.iterations - 1, env_steps=metrics["env_steps"])
+
+
+WORK = {"train": train, "measure": measure}
 
 
 def clock(seconds: float) -> str:

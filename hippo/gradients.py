@@ -282,7 +282,8 @@ def measure(
     Args: as `hippo.hippo.train`; the checkpoint is that of a run of ten iterations for the paper's iteration 10.
 
     Returns:
-        `cosine_similarities` and `skill_separation`, and `iteration`.
+        `iteration`, the batch's number, and `env_steps` up to and with it; then the quantities of `cosine_similarities`
+        and `skill_separation`.
     """
     envs = make_envs(config.num_envs, "training")
     policy = restored_policy(config, envs, checkpoint)
@@ -292,6 +293,7 @@ def measure(
     envs.close()
     return {
         "iteration": iteration,
+        "env_steps": (iteration + 1) * batch.steps.num_steps,
         **cosine_similarities(policy, batch, estimate.manager, estimate.skills),
         **skill_separation(policy, batch),
     }

@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -210,9 +211,9 @@ def test_a_run_that_diverges_or_fails_says_so(tmp_path, monkeypatch, capsys):
     run = compose_run([*TINY, f"runs_dir={tmp_path}"])
 
     def diverge(*_):
-        raise train.Diverged("iteration 1: parameters has 3 non-finite of 9 entries")
+        raise train.Diverged("iteration 1: parameters has 3 non-finite of 9 entries", {"name": "parameters"})
 
-    monkeypatch.setattr(train, "train", diverge)
+    monkeypatch.setitem(train.WORK, "train", diverge)
     assert train.execute(run) == "diverged"
     assert json.loads((run.folder / "status.json").read_text())["message"].startswith("iteration 1: parameters")
     assert train.EXIT_CODES["diverged"] == 3
@@ -220,7 +221,8 @@ def test_a_run_that_diverges_or_fails_says_so(tmp_path, monkeypatch, capsys):
     def fail(*_):
         raise RuntimeError("out of luck")
 
-    monkeypatch.setattr(train, "train", fail)
+    assert load(run.folder / "diverged.pt") == {"name": "parameters"}
+    monkeypatch.setitem(train.WORK, "train", fail)
     assert train.execute(run) == "failed"
     assert "RuntimeError: out of luck" in json.loads((run.folder / "status.json").read_text())["message"]
     assert "Traceback" in capsys.readouterr().err
@@ -270,6 +272,25 @@ def test_a_sweep_trains_what_is_missing_once_and_writes_its_plan(tiny_figure, tm
     assert all((tmp_path / i / "progress.csv").stat().st_mtime_ns == t for i, t in stamps.items())
     assert sweep.main(["status", *arguments[1:]]) == 0
     assert capsys.readouterr().out.count("finished") == 4
+
+
+def test_a_measurement_trains_its_parent_first_and_shares_it(tmp_path, capsys):
+    settings = ["--set", "iterations=1", "--set", "batch_size=400", "--set", "env.horizon=50"]
+    assert sweep.main(["run", "table2", *settings, "--runs-dir", str(tmp_path)]) == 0
+    plan = json.loads((tmp_path / "plans/smoke/table2.json").read_text())
+    assert {(r["kind"], r["state"]) for r in plan["runs"]} == {("measure", "finished")}
+    ids = {r["run_id"] for r in plan["runs"]}
+    parents = {p.name for p in tmp_path.iterdir() if (p / "checkpoint.pt").exists()}
+    assert len(parents) == len(ids) == 8
+    assert not parents & ids
+    (row,) = (tmp_path / min(ids) / "progress.csv").read_text().splitlines()[1:]
+    assert row.startswith("1,")  # the batch after one iteration of training
+    run = compose_run(["env=ant_gather", "scale=smoke", *settings[1::2], f"runs_dir={tmp_path}"])
+    assert run.run_id in parents  # the same training by hand is the same run
+    shutil.rmtree(tmp_path / max(ids))
+    capsys.readouterr()
+    assert sweep.main(["run", "table2", *settings, "--runs-dir", str(tmp_path)]) == 0
+    assert "to train: 1 runs" in capsys.readouterr().out
 
 
 def test_committed_rows_stand_in_for_training_unless_fresh_is_asked_for(tiny_figure, tmp_path, monkeypatch):

@@ -62,5 +62,8 @@ def test_a_batch_without_a_completed_episode_has_no_return():
 
 
 def test_a_non_finite_tensor_stops_the_run_with_its_name():
-    with pytest.raises(Diverged, match="iteration 7: rewards has 1 non-finite of 3"):
+    with pytest.raises(Diverged, match="iteration 7: rewards has 1 non-finite of 3") as caught:
         check_finite(7, observations=torch.ones(2), rewards=torch.tensor([1.0, float("nan"), 2.0]))
+    dump = caught.value.dump
+    assert (dump["iteration"], dump["name"], dump["indices"].tolist()) == (7, "rewards", [[1]])
+    check_finite(7, observations=torch.ones(2))

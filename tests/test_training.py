@@ -9,6 +9,7 @@ from hippo import hippo
 from hippo.core import seeding
 from hippo.core.checkpoint import Checkpoint, load
 from hippo.core.hierarchy import HierarchicalPolicy, collect, levels
+from hippo.core.log import Diverged
 from hippo.core.policies import GaussianPolicy
 from hippo.core.ppo import maximize
 from tests.toy import TargetEnv, progress, run
@@ -157,3 +158,25 @@ def test_hier_vpgs_step_is_the_first_step_of_hippo():
         gradients.append(torch.cat([p.grad.flatten() for p in policy.parameters()]))
     torch.testing.assert_close(gradients[0], gradients[1])
     assert gradients[0].abs().sum() > 0
+
+
+@learners
+def test_a_nan_in_the_parameters_stops_the_run_within_the_iteration_and_reaches_no_checkpoint(
+    name, tmp_path, monkeypatch
+):
+    train, config = learner(name, iterations=3, batch_size=200)
+    step, calls = torch.optim.Adam.step, 0
+
+    def poisoned(self, *arguments):
+        nonlocal calls
+        calls += 1
+        step(self, *arguments)
+        if calls == config.__dict__.get("updates", 1) + 1:  # in the second iteration
+            with torch.no_grad():
+                self.param_groups[0]["params"][0].view(-1)[0] = float("nan")
+
+    monkeypatch.setattr(torch.optim.Adam, "step", poisoned)
+    with pytest.raises(Diverged, match="iteration 1: parameters has"):
+        run(train, config, tmp_path)
+    assert (tmp_path / "progress.csv").read_text().count("\n") == 2
+    assert load(tmp_path / "checkpoint.pt")["iteration"] == 0

@@ -7,23 +7,34 @@ import csv
 import io
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
 
+DUMPED = 1000  # indices of bad entries kept in a dump
 Row = Mapping[str, float | int]
 
 
 class Diverged(RuntimeError):
-    """Training produced a number that is not finite; the run stops with this one-line cause."""
+    """Training produced a number that is not finite; the run stops with this one-line cause.
+
+    `dump` says where: the iteration, the tensor's name and shape, and the indices of its first bad entries. With the
+    checkpoint of the iteration before, which repeats it exactly, that is all a diagnosis needs.
+    """
+
+    def __init__(self, message: str, dump: dict[str, Any] | None = None) -> None:
+        super().__init__(message)
+        self.dump = dump or {}
 
 
 def check_finite(iteration: int, **tensors: Tensor) -> None:
     """Raise Diverged naming the first of `tensors` that holds a NaN or an infinity."""
     for name, tensor in tensors.items():
         if not bool(torch.isfinite(tensor).all()):
-            bad = int((~torch.isfinite(tensor)).sum())
-            raise Diverged(f"iteration {iteration}: {name} has {bad} non-finite of {tensor.numel()} entries")
+            bad = (~torch.isfinite(tensor)).nonzero()
+            dump = {"iteration": iteration, "name": name, "shape": list(tensor.shape), "indices": bad[:DUMPED]}
+            raise Diverged(f"iteration {iteration}: {name} has {len(bad)} non-finite of {tensor.numel()} entries", dump)
 
 
 class RunLog:
