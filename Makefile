@@ -15,7 +15,6 @@ RUN = $(BIN)/python -m
 SWEEP_FLAGS = --scale $(SCALE) --launcher $(LAUNCHER) --runs-dir $(RUNS_DIR) $(if $(FRESH),--fresh) $(if $(YES),--yes)
 DRAW_FLAGS = --scale $(SCALE) --runs-dir $(RUNS_DIR)
 
-TRAINED := $(sort $(basename $(notdir $(wildcard experiments/conf/figure/*.yaml))))
 FIGURES := $(filter fig%,$(basename $(notdir $(wildcard paper_figures/fig*.py))))
 TABLES := $(filter table%,$(basename $(notdir $(wildcard paper_figures/table*.py))))
 
@@ -34,6 +33,9 @@ $(FIGURES) $(TABLES): install
 
 all: $(FIGURES) $(TABLES)  ## every figure and table at SCALE
 
+report: install  ## one page with everything drawn at SCALE
+	@$(RUN) analysis.report $(DRAW_FLAGS)
+
 plan-%: install
 	@$(RUN) experiments.sweep plan $* $(SWEEP_FLAGS)
 
@@ -42,7 +44,7 @@ lint: install  ## ruff (format and rules) and mypy
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 
-test: install  ## the fast tests (what CI runs)
+test: install  ## every test but the slow ones
 	$(RUN) pytest -m "not slow and not slurm"
 
 smoke: fig3  ## train and draw Figure 3 at smoke scale
@@ -59,4 +61,4 @@ help:  ## this list
 	@echo "  make tableN      the same for: $(or $(TABLES),none yet)"
 	@echo "  make plan-figN   what it would train and cost, without training"
 
-.PHONY: install all lint test smoke bench clean help $(FIGURES) $(TABLES)
+.PHONY: install all report lint test smoke bench clean help $(FIGURES) $(TABLES)

@@ -74,7 +74,7 @@ def read_progress(path: Path, metrics: Sequence[str] | None) -> pd.DataFrame:
     if not whole:
         return pd.DataFrame(columns=["env_steps", "metric", "value"])
     table = pd.read_csv(io.StringIO(whole))
-    columns = [c for c in table.columns if c not in ("iteration", "env_steps")] if metrics is None else list(metrics)
+    columns = [c for c in table.columns if c not in ("iteration", "env_steps") and (metrics is None or c in metrics)]
     return table.melt(id_vars="env_steps", value_vars=columns, var_name="metric")
 
 

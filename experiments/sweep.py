@@ -120,7 +120,7 @@ def make_plan(figure: str, scale: str, settings: Sequence[str], fresh: bool, run
             chosen = [f"env={env}", f"algo={what['algo']}", f"scale={scale}", f"runs_dir={runs_dir}"]
             for seed in range(seeds):
                 run = compose_run([*chosen, *what.get("settings", []), *settings, f"seed={seed}"])
-                run = dataclasses.replace(run, kind=description.get("kind", "train"))
+                run = dataclasses.replace(run, kind=what.get("kind", description.get("kind", "train")))
                 state = read_status(run.folder)["state"]
                 if state != "finished" and run.run_id in committed:
                     state = "committed"

@@ -274,6 +274,33 @@ def restored_baselines(config: HierarchyConfig, envs: Any, checkpoint: Checkpoin
     return baselines, checkpoint.restore(baselines=baselines)
 
 
+def baseline_variances(
+    policy: HierarchicalPolicy, baselines: Baselines, fitting: Batch, batch: Batch, config: HierarchyConfig
+) -> dict[str, float]:
+    """`gradient_variance` with no, the single and the skill-conditioned baseline (section 4.2).
+
+    Both baselines are refitted to one batch of the policy and used on another, as in training, but with up to 200
+    evaluations, so that what differs is what they see rather than how far the fit got.
+
+    Returns:
+        `variance_none`, `variance_single`, `variance_skill`.
+    """
+    baselines.evaluations = 200
+    returns = step_returns(fitting, config)
+    baselines.fit(fitting, {"single": returns, "skill": returns})
+    result = {}
+    for kind in ("none", "single", "skill"):
+        value = baselines.predict(kind, batch.steps.obs, batch.time_left, batch.skill)[:-1]
+        result[f"variance_{kind}"] = gradient_variance(policy, batch, step_returns(batch, config) - value)
+    return result
+
+
+def step_returns(batch: Batch, config: HierarchyConfig) -> Tensor:
+    """(T, N) discounted return from every step to the end of its episode or of the batch."""
+    steps, zero = batch.steps, torch.zeros_like(batch.steps.reward)
+    return gae(steps.reward, zero, zero, steps.terminated, steps.done, config.gamma, 1.0)
+
+
 def measure(
     config: HierarchyConfig, make_envs: Callable[[int, str], Any], seed: int, checkpoint: Checkpoint
 ) -> dict[str, float]:
@@ -282,47 +309,20 @@ def measure(
     Args: as `hippo.hippo.train`; the checkpoint is that of a run of ten iterations for the paper's iteration 10.
 
     Returns:
-        `iteration`, the batch's number, and `env_steps` up to and with it; then the quantities of `cosine_similarities`
-        and `skill_separation`.
+        `iteration`, the batch's number, and `env_steps` up to and with it; then the quantities of
+        `cosine_similarities`, `skill_separation` and `baseline_variances`.
     """
     envs = make_envs(config.num_envs, "training")
     policy = restored_policy(config, envs, checkpoint)
     baselines, iteration = restored_baselines(config, envs, checkpoint)
     batch = collect(policy, envs, config, seed, iteration)
     estimate = advantages(batch, baselines, config)
+    another = collect(policy, envs, config, seed, iteration + 1)
     envs.close()
     return {
         "iteration": iteration,
         "env_steps": (iteration + 1) * batch.steps.num_steps,
         **cosine_similarities(policy, batch, estimate.manager, estimate.skills),
         **skill_separation(policy, batch),
+        **baseline_variances(policy, baselines, another, batch, config),
     }
-
-
-def baseline_variances(
-    config: HierarchyConfig, make_envs: Callable[[int, str], Any], seed: int, checkpoint: Checkpoint
-) -> dict[str, float]:
-    """`gradient_variance` of one policy with no, the single and the skill-conditioned baseline (section 4.2).
-
-    Both baselines are fitted to one batch of the policy and used on the next, as in training, but until the fit
-    converges, so that what differs is what they see.
-    """
-    envs = make_envs(config.num_envs, "training")
-    policy = restored_policy(config, envs, checkpoint)
-    baselines, iteration = restored_baselines(config, envs, checkpoint)
-    fitting, batch = (collect(policy, envs, config, seed, iteration + i) for i in (0, 1))
-    envs.close()
-    baselines.evaluations = 200
-    returns = step_returns(fitting, config)
-    baselines.fit(fitting, {"single": returns, "skill": returns})
-    result = {}
-    for kind in ("none", "single", "skill"):
-        value = baselines.predict(kind, batch.steps.obs, batch.time_left, batch.skill)[:-1]
-        result[kind] = gradient_variance(policy, batch, step_returns(batch, config) - value)
-    return result
-
-
-def step_returns(batch: Batch, config: HierarchyConfig) -> Tensor:
-    """(T, N) discounted return from every step to the end of its episode or of the batch."""
-    steps, zero = batch.steps, torch.zeros_like(batch.steps.reward)
-    return gae(steps.reward, zero, zero, steps.terminated, steps.done, config.gamma, 1.0)

@@ -3,7 +3,8 @@
 import argparse
 import hashlib
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -20,8 +21,8 @@ NOT_A_RESULT = {"smoke": "smoke"}  # scales whose pictures say nothing about the
 
 
 def unique(results: Results, key: str) -> dict[str, str]:
-    """Environments or variants of the plan, in its order: name -> label."""
-    return {run[key]: run[f"{key}_label"] for run in results.plan["runs"]}
+    """Environments or trained variants of the plan, in its order: name -> label."""
+    return {run[key]: run[f"{key}_label"] for run in results.plan["runs"] if run["kind"] == "train"}
 
 
 def draw_panel(axes: Axes, results: Results, env: str, unit: float) -> dict[str, int]:
@@ -50,7 +51,7 @@ def caption(results: Results, seeds: dict[str, dict[str, int]]) -> str:
     plan = results.plan
     counts = sorted({n for env in seeds.values() for n in env.values()})
     n = f"{counts[0]}" if len(counts) == 1 else f"{counts[0]} to {counts[-1]} (printed in each panel)"
-    physics = ", ".join(sorted({f"{run['env_label']}: {run['physics']} physics" for run in plan["runs"]}))
+    physics = ", ".join(dict.fromkeys(f"{run['env_label']}: {run['physics']} physics" for run in plan["runs"]))
     lines = [
         f"{plan['title']}. Scale: {plan['scale']}.",
         f"Mean undiscounted return of the episodes that open an iteration, against environment steps. n = {n} seeds; "
@@ -73,13 +74,23 @@ def provenance(results: Results) -> str:
     return f"{len(ids)} runs, set {digest}: {' '.join(ids)}"
 
 
-def draw(results: Results, out: Path) -> list[Path]:
+@dataclass(frozen=True)
+class Extra:
+    """A second row of panels under the learning curves."""
+
+    metrics: tuple[str, ...]
+    draw: Callable[[Axes, Results, str], None]  # fills the panel of one environment
+    label: str  # of the first panel's y axis
+    caption: str
+
+
+def draw(results: Results, out: Path, extra: Extra | None = None) -> list[Path]:
     """Draw and write <figure>.csv, .pdf, .png and .caption.txt under `out`/<scale>/; returns the paths."""
     style.use()
     plan = results.plan
     environments, variants = unique(results, "env"), unique(results, "variant")
     columns = min(4, len(environments))
-    rows = -(-len(environments) // columns)
+    rows = -(-len(environments) // columns) + (extra is not None)
     figure, grid = plt.subplots(
         rows, columns, figsize=(style.WIDTH, 2.25 * rows + 0.55), squeeze=False, layout="constrained"
     )
@@ -104,6 +115,12 @@ def draw(results: Results, out: Path) -> list[Path]:
         axes.set_axis_off()
     for axes in grid[:, 0]:
         axes.set_ylabel("return")
+    if extra is not None:
+        for axes, env in zip(grid[-1], environments, strict=False):
+            axes.set_axis_on()
+            axes.patch.set_visible(False)
+            extra.draw(axes, results, env)
+        grid[-1, 0].set_ylabel(extra.label)
     handles = [Line2D([], [], color=style.color_of(v, list(variants)), label=label) for v, label in variants.items()]
     figure.legend(handles=handles, loc="outside upper center", ncols=min(5, len(handles)), columnspacing=1.2)
     if plan["scale"] in NOT_A_RESULT:
@@ -113,11 +130,11 @@ def draw(results: Results, out: Path) -> list[Path]:
     plt.close(figure)
     csv, text_path = stem.with_suffix(".csv"), stem.with_suffix(".caption.txt")
     results.frame.to_csv(csv, index=False, lineterminator="\n")
-    text_path.write_text(caption(results, seeds))
+    text_path.write_text(caption(results, seeds) + ("" if extra is None else extra.caption + "\n"))
     return [csv, *paths, text_path]
 
 
-def main(figure: str, arguments: Sequence[str] | None = None) -> int:
+def main(figure: str, arguments: Sequence[str] | None = None, extra: Extra | None = None) -> int:
     """Draw one figure from the command line; exit code 2 where there is nothing to draw."""
     parser = argparse.ArgumentParser(prog=f"paper_figures.{figure}", description=f"Draw {figure}.")
     parser.add_argument("--scale", default="smoke", help="smoke, laptop or paper")
@@ -126,11 +143,12 @@ def main(figure: str, arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, default=HERE / "out")
     options = parser.parse_args(arguments)
     try:
-        results = load(figure, options.scale, options.runs_dir, options.data)
+        metrics = ("return_mean", *(extra.metrics if extra is not None else ()))
+        results = load(figure, options.scale, options.runs_dir, options.data, metrics)
     except (MissingData, ValueError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     for run in results.missing:
         print(f"missing or incomplete: {run['env']} {run['variant']} seed {run['seed']} ({run['state']})")
-    print("wrote " + " ".join(str(path) for path in draw(results, options.out)))
+    print("wrote " + " ".join(str(path) for path in draw(results, options.out, extra)))
     return 0

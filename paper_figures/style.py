@@ -17,6 +17,8 @@ COLORS = {
     "ppo": "#D55E00",
     "ppo_repeat": "#E69F00",
     "hier_vpg": "#009E73",
+    "hippo_random_single": "#7B3294",
+    "hippo_p10_single": "#A6761D",
 }
 SPARE_COLORS = ("#000000", "#7F7F7F", "#8C564B", "#17BECF")
 

@@ -54,47 +54,66 @@ def driven(xs, robot="hopper"):
 def test_a_wall_pays_once_in_order_and_also_several_in_one_step():
     assert driven([0, 2.04, 2.06, 1.0, 2.06, 4.1, 0.0, 4.1]) == [0, 0, 1, 0, 0, 1, 0, 0]
     assert driven([6.1]) == [3]
+    assert driven([-3.0, 0.0, 2.0]) == [0, 0, 0]  # reaching a wall does not pay
+    back_and_forth = [2.06 if t % 2 else 0.0 for t in range(20)]
+    assert sum(driven(back_and_forth)) == 1
+    assert sum(np.diff([0, *blocks.next_wall(np.array(back_and_forth), TRACK)]) > 0) == 10  # without a memory
+    assert driven(np.linspace(0, 100.06, 400)).count(1) == 50  # far faces at 2.05, ..., 100.05
     assert driven([1.5, 1.56], "half_cheetah") == [0, 1]  # its first far face is at 1.55
 
 
-@pytest.mark.parametrize("name", ["block_hopper", "block_half_cheetah"])
-def test_a_probe_dropped_on_every_wall_rests_at_its_drawn_height(name):
+@pytest.mark.parametrize(("name", "first_wall"), [("block_hopper", 2.0), ("block_half_cheetah", 1.5)])
+def test_a_probe_dropped_on_every_wall_rests_at_its_drawn_height(name, first_wall):
     """Also after a second reset and after the ring has turned."""
     env = make(name, 2, 0)
     env.reset(seed=1)
-    rng = np.random.default_rng(0)
-    for phase in ("first episode", "second episode", "turned ring"):
+    seen = []
+    for phase, first in (("first episode", 0), ("second episode", 0), ("turned ring", 6)):
         if phase == "second episode":
             env.reset()
-        if phase == "turned ring":
-            x = list(env.observation_names).index("com_x")
-            env.physics.qpos[:, 1 if name == "block_hopper" else 0] += 9.0
+        if phase == "turned ring":  # to 0.5 m before wall 10: walls 6 to 17 stand, walls 0 to 5 are gone
+            env.physics.qpos[:, 1 if name == "block_hopper" else 0] += first_wall + 2 * 10 - 0.5
             env.physics.forward(np.arange(2))
-            obs = env.step(rng.uniform(-0.1, 0.1, env.action_space.shape))[0]
-            assert (obs[:, x] > 8).all()
-            assert (env.task.ahead >= 4).all()
+            env.step(np.zeros(env.action_space.shape))
+            assert env.task.ahead.tolist() == [10, 10]
+        k = np.arange(first, first + 12)
         for i in range(2):
-            index = blocks.ring_indices(env.task.ahead)[i]
-            expected = blocks.height_of(index[None], env.task.heights[i : i + 1])[0]
-            np.testing.assert_allclose(rest_heights(env, i), expected, rtol=0, atol=5e-3)  # contacts are soft
-    assert np.ptp(env.task.heights) > 0.1  # otherwise any height would do
+            expected = env.task.heights[i, k]
+            np.testing.assert_allclose(drop(env, i, first_wall + 2.0 * k), expected, rtol=0, atol=3e-3)  # soft contacts
+            np.testing.assert_allclose(rays(env, i, first_wall + 2.0 * k), expected, rtol=0, atol=1e-12)
+            np.testing.assert_allclose(rays(env, i, first_wall + 2.0 * k + 0.06), 0, atol=1e-12)  # 0.05 m to a face
+            seen.append(expected)
+    if name == "block_hopper":  # where the ring has left, there is only floor
+        np.testing.assert_allclose(drop(env, 0, 2.0 + 2.0 * np.arange(6)), 0, atol=3e-3)
+    for i, a in enumerate(seen):  # otherwise old heights, or those of another simulation, would do
+        assert all(np.abs(a - b).max() > 0.02 for b in seen[:i])
 
 
-def rest_heights(env, i, radius=0.02):
-    """Where small spheres come to rest on the walls of simulation i: the same model plus one free sphere a wall."""
+def drop(env, i, x, half=0.02):
+    """Heights at which small boxes dropped from 0.4 m at `x` come to rest: simulation i's walls and free boxes."""
     spec = env.robot.spec("paper")
+    spec.option.timestep = 0.004
     env.task.build(spec)
-    for slot, position in enumerate(env.physics.mocap_pos[i]):
-        body = spec.worldbody.add_body(name=f"probe_{slot}", pos=[position[0], 2.0, position[2] + 1.0 + radius + 0.01])
+    for n, at in enumerate(x):
+        body = spec.worldbody.add_body(name=f"probe_{n}", pos=[at, 2.0, 0.4 + half])
         body.add_freejoint()
-        body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=[radius] * 3, density=500, condim=3)
+        body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=[half] * 3, density=500, condim=3)
     model = spec.compile()
     data = mujoco.MjData(model)
     data.mocap_pos[:] = env.physics.mocap_pos[i]
-    while data.time < 0.6:
+    while data.time < 1.0:
         mujoco.mj_step(model, data)
-    mujoco.mj_forward(model, data)
-    return np.array([data.body(f"probe_{slot}").xpos[2] - radius for slot in range(blocks.RING)])
+    return np.array([data.body(f"probe_{n}").xpos[2] - half for n in range(len(x))])
+
+
+def rays(env, i, x):
+    """Heights at which rays straight down at `x`, beside the robot, meet simulation i itself."""
+    data, geom = env.physics.data(i), np.zeros(1, np.int32)
+    mujoco.mj_kinematics(env.physics.model, data)
+    down = np.array([0.0, 0.0, -1.0])
+    return np.array(
+        [1 - mujoco.mj_ray(env.physics.model, data, np.array([at, 2.0, 1.0]), down, None, 1, -1, geom) for at in x]
+    )
 
 
 @pytest.mark.parametrize(("height", "passes"), [(0.9, False), (0.001, True)])

@@ -62,6 +62,11 @@ def test_bins_start_straight_behind_and_go_counter_clockwise():
 
 def test_an_object_exactly_behind_belongs_to_the_last_bin():
     assert np.flatnonzero(scene(("bomb", -2.0, 0.0))).tolist() == [19]
+    assert np.flatnonzero(scene(("bomb", -2.0, -0.0))).tolist() == [19]  # atan2 gives -pi instead of pi
+    assert np.flatnonzero(scene(("bomb", 0.0, -2.0), yaw=math.pi / 2)).tolist() == [19]
+    # A hair to the robot's right lies counter-clockwise of straight behind, a hair to its left closes the circle.
+    assert np.flatnonzero(scene(("bomb", -2.0, -1e-9))).tolist() == [10]
+    assert np.flatnonzero(scene(("bomb", -2.0, 1e-9))).tolist() == [19]
 
 
 def test_the_lidar_turns_with_the_robot():
@@ -81,6 +86,8 @@ def test_objects_are_caught_within_one_metre_exclusive():
     objects = np.array([[[1.0, 0.0], [0.999, 0.0], [0.8, 0.59], [0.8, 0.61]] + [[9, 9]] * 12])
     caught = gather.catch(np.zeros((1, 2)), objects, np.ones((1, 16), bool))[0]
     assert caught[:4].tolist() == [False, True, True, False]
+    just = np.array([[[math.nextafter(1.0, 0.0), 0.0], [0.0, -math.nextafter(1.0, 2.0)]] + [[9, 9]] * 14])
+    assert gather.catch(np.zeros((1, 2)), just, np.ones((1, 16), bool))[0, :2].tolist() == [True, False]
     gone = np.ones((1, 16), bool)
     gone[0, 1] = False
     assert not gather.catch(np.zeros((1, 2)), objects, gone)[0, 1]
@@ -95,6 +102,22 @@ def test_placement_uses_distinct_cells_off_the_origin():
         assert (np.abs(cells).sum(1) > 0).all()
         placed = gather.place(np.random.default_rng(0), cells)
         assert len(np.unique(placed, axis=0)) == 16
+
+
+@pytest.mark.parametrize(("grid", "reaches_six"), [("original", False), ("symmetric", True)])
+def test_placement_in_an_environment_reaches_plus_six_only_on_the_symmetric_grid(grid, reaches_six):
+    env = make("snake_gather", 20, 0, grid=grid)
+    seen = []
+    for _ in range(5):
+        env.reset()
+        seen.append(env.task.objects.copy())
+    seen = np.concatenate(seen)  # (100, 16, 2)
+    assert all(len(np.unique(layout, axis=0)) == 16 for layout in seen)
+    assert (np.abs(seen).max(-1) >= 2).all()  # never the origin
+    assert seen.min() == -6
+    assert bool((seen == 6).any()) is reaches_six
+    assert len(np.unique(seen.reshape(100, -1), axis=0)) == 100  # every episode and environment has its own
+    assert np.unique(seen[:, :8].reshape(-1, 2), axis=0).shape == np.unique(seen[:, 8:].reshape(-1, 2), axis=0).shape
 
 
 def test_every_cell_is_about_equally_likely():
@@ -122,7 +145,11 @@ def test_rewards_of_catching_add_up_and_nothing_comes_back():
     assert reward.tolist() == [1.0, 0.0]
     assert info["reward_objects"].tolist() == [1.0, 0.0]
     assert env.task.present.sum(1).tolist() == [13, 16]
-    assert env.step(np.zeros((2, 4)))[1].tolist() == [0.0, 0.0]
+    obs, reward, _, _, _ = env.step(np.zeros((2, 4)))  # the robot is still where they were
+    assert reward.tolist() == [0.0, 0.0]
+    assert not obs[:, env.robot_size :].any()  # and sees none of them
+    env.task.present[0] = True
+    assert env.step(np.zeros((2, 4)))[1].tolist() == [1.0, 0.0]  # had they come back, they would pay again
     assert not terminated.any()
 
 
@@ -155,6 +182,7 @@ def test_the_velocity_penalty_worked_by_hand():
     # Ant: 0 up to 1.2 m/s, then 0.001 + 0.0025 (v - 1.2): at 2.2 it is 0.0035. Snake: at 0.211, 0.001 + 0.0005 / 10.
     ant, snake = gather.PENALTIES["ant"], gather.PENALTIES["snake"]
     assert ant(np.array([0.0, 1.2, 2.2])).tolist() == pytest.approx([0.0, 0.0, 0.0035])
+    assert ant(np.array([1.2 + 1e-9]))[0] == pytest.approx(0.001, abs=1e-9)  # it jumps by the bias
     assert snake(np.array([0.111, 0.211])).tolist() == pytest.approx([0.0, 0.00105])
 
 
@@ -188,6 +216,14 @@ def test_a_layout_seed_fixes_objects_for_good_and_everywhere_but_not_the_pose():
     env.step(np.zeros((3, 8)))
     second = env.step(np.zeros((3, 8)))[0]  # every episode ended: these are the next ones' first observations
     assert np.array_equal(env.task.objects, layout)
-    assert not np.array_equal(first[:, :27], second[:, :27])
+    third, _ = env.reset()
+    assert np.array_equal(env.task.objects, layout)
+    for a, b in ((first, second), (second, third), (first[:1], first[1:2])):
+        assert not np.array_equal(a[:, :27], b[:, :27])
+    other = make("ant_gather", 2, 99)
+    other.reset(options={"layout_seed": 7})
+    assert np.array_equal(other.task.objects, layout[:2])
+    other.reset(options={"layout_seed": 8})
+    assert not (other.task.objects == layout[:2]).all()
     env.reset(options={"layout_seed": None})
     assert not (env.task.objects == layout).all()

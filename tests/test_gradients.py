@@ -238,6 +238,10 @@ def test_a_trained_run_is_measured_on_its_next_batch_before_any_update(tmp_path)
     assert first["iteration"] == 2
     assert -1 <= first["cosine_batch"] <= 1
     assert first["trajectories"] == 10
-    variances = gradients.baseline_variances(config, make_envs, 0, Checkpoint(tmp_path))
-    assert set(variances) == {"none", "single", "skill"}
-    assert variances["single"] < variances["none"]
+    # No baseline: the variance of the plain returns' gradient on that batch.
+    policy = HierarchicalPolicy(config, 2, 2, 2, torch.Generator())
+    Checkpoint(tmp_path).restore(policy=policy)
+    batch = collect(policy, TargetEnv(10, 0), config, 0, 2)
+    returns = gradients.step_returns(batch, config)
+    assert first["variance_none"] == pytest.approx(gradients.gradient_variance(policy, batch, returns), rel=1e-6)
+    assert len({first[f"variance_{kind}"] for kind in ("none", "single", "skill")}) == 3

@@ -32,6 +32,45 @@ def test_batch_stepping_is_exactly_a_plain_loop(name, num_threads):
             assert np.array_equal(data.qvel, physics.qvel[i])
 
 
+@pytest.mark.parametrize("num_threads", [1, 2])
+@pytest.mark.parametrize("name", ["block_hopper", "block_half_cheetah"])
+def test_batch_stepping_is_exactly_a_plain_loop_while_walls_move(name, num_threads):
+    """The robots are carried 1.5 m a turn, so the ring turns; the plain loop gets the walls' positions copied in."""
+    env = make(name, 3, 0, num_threads=num_threads)
+    env.reset(seed=3)
+    physics, model = env.physics, env.physics.model
+    datas, blind = [mujoco.MjData(model) for _ in range(3)], mujoco.MjData(model)
+    x = 1 if name == "block_hopper" else 0
+    rng, moved, touched, differs = np.random.default_rng(0), 0, 0, False
+    for turn in range(24):
+        for data, row in zip(datas, physics.get_state(), strict=True):
+            mujoco.mj_setState(model, data, row, mujoco.mjtState.mjSTATE_INTEGRATION)
+            data.qpos[x] += 1.5 * (turn > 0)
+        physics.qpos[:, x] += 1.5 * (turn > 0)
+        for _ in range(4):
+            walls = physics.mocap_pos.copy()
+            mujoco.mj_copyData(blind, model, datas[0])
+            blind.mocap_pos[:, 2] = -10  # the same robot where there are no walls
+            _, _, _, truncated, _ = env.step(rng.uniform(-1, 1, (3, model.nu)))
+            assert not truncated.any()
+            for data, before, i in zip(datas, walls, range(3), strict=True):
+                data.mocap_pos[:], data.ctrl[:] = before, physics.ctrl[i]
+                for _ in range(physics.frame_skip):
+                    mujoco.mj_step(model, data)
+                assert np.array_equal(data.qpos, physics.qpos[i])
+                assert np.array_equal(data.qvel, physics.qvel[i])
+                blocks = data.contact.geom[: data.ncon] if data.ncon else np.zeros((0, 2), int)
+                touched += any(model.geom(g).name.startswith("block_") for g in blocks.ravel())
+            blind.ctrl[:] = physics.ctrl[0]
+            for _ in range(physics.frame_skip):
+                mujoco.mj_step(model, blind)
+            differs |= not np.array_equal(blind.qpos, physics.qpos[0])
+            moved += int((physics.mocap_pos != walls).any())
+    assert moved >= 8
+    assert touched >= 8
+    assert differs
+
+
 @pytest.mark.parametrize("name", ENVIRONMENTS)
 def test_derived_fields_are_those_of_the_new_state(name):
     env = make(name, 2, 0)
@@ -73,10 +112,13 @@ def test_a_diverged_simulation_ends_alone(name, bad):
     others = [0, 1, 3]
     for t, (expected, got) in enumerate(zip(clean, injected, strict=True)):
         assert np.array_equal(expected[0][others], got[0][others])
-        assert np.array_equal(expected[1][others], got[1][others])
+        for k in (1, 2, 3):
+            assert np.array_equal(expected[k][others], got[k][others])
         assert np.isfinite(got[0]).all()
         assert got[4]["diverged"].tolist() == [False, False, t == 6, False]
     _, reward, terminated, truncated, info = injected[6]
     assert (reward[2], terminated[2], truncated[2]) == (0.0, False, True)
     assert np.array_equal(info["final_obs"][2], injected[5][0][2])  # the last finite observation
+    assert np.isfinite(info["final_obs"]).all()
     assert info["_final_obs"].tolist() == [False, False, True, False]
+    assert not np.array_equal(clean[6][0][2], injected[6][0][2])

@@ -24,7 +24,10 @@ MASSES = {
         "ffoot": 0.8845,
     },
     "snake": dict.fromkeys(("torso", "mid", "back", "back2", "back3"), 35.6047),
-    "ant": {"torso": 0.32725, "front_left_leg": 0.03916, "aux_1": 0.03916, "foot_1": 0.06759, "foot_4": 0.06759},
+    "ant": {"torso": 0.32725}
+    | dict.fromkeys(("front_left_leg", "front_right_leg", "back_leg", "right_back_leg"), 0.03916)
+    | {f"aux_{i}": 0.03916 for i in range(1, 5)}
+    | {f"foot_{i}": 0.06759 for i in range(1, 5)},
 }
 TOTAL = {"hopper": 15.820, "half_cheetah": 14.0, "snake": 178.024, "ant": 0.91088}
 
@@ -32,14 +35,35 @@ TOTAL = {"hopper": 15.820, "half_cheetah": 14.0, "snake": 178.024, "ant": 0.9108
 @pytest.mark.parametrize("robot", MASSES)
 def test_masses_are_the_originals_also_with_walls_in_the_world(robot):
     model = model_of(robot)
+    bodies = {model.body(i).name for i in range(1, model.nbody)}
+    assert {name for name in bodies if not name.startswith("block_")} == set(MASSES[robot])
     for body, mass in MASSES[robot].items():
         assert model.body(body).mass[0] == pytest.approx(mass, rel=1e-3), body
     assert model.body_mass.sum() == pytest.approx(TOTAL[robot], rel=1e-4)
     assert model.body("torso").subtreemass[0] == pytest.approx(TOTAL[robot], rel=1e-4)
 
 
+@pytest.mark.filterwarnings("ignore:compiler attribute 'settotalmass' is deprecated")
+def test_a_total_mass_set_over_the_world_would_count_the_walls_in():
+    # The original's settotalmass="14" with 12 boxes of 0.1 x 10 x 2 m = 2000 kg each at the default density: the robot
+    # keeps 14 * 14 / (14 + 12 * 2000) = 0.0082 kg. This is why its masses are written out.
+    robot, walls = 14.0, 12 * 0.1 * 10 * 2 * 1000
+    env = make("block_half_cheetah", 1, 0)
+    spec = env.robot.spec("paper")
+    env.task.build(spec)
+    for geom in spec.geoms:
+        if geom.name.startswith("block_"):
+            geom.mass = np.nan  # as if none were given
+    spec.compiler.settotalmass = 14
+    wrong = spec.compile()
+    assert wrong.body("torso").subtreemass[0] == pytest.approx(14 * robot / (robot + walls), rel=1e-3)
+    assert env.physics.model.body("torso").subtreemass[0] == pytest.approx(14, rel=1e-4)
+
+
 def test_a_snake_links_inertia_is_that_of_the_original():
-    assert np.sort(model_of("snake").body("mid").inertia) == pytest.approx([0.1738, 3.9176, 3.9176], rel=1e-3)
+    model = model_of("snake")
+    for link in MASSES["snake"]:
+        assert np.sort(model.body(link).inertia) == pytest.approx([0.1738, 3.9176, 3.9176], rel=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -61,26 +85,36 @@ def test_fast_physics_is_another_integrator_over_the_same_time(robot, timestep, 
     assert np.array_equal(fast.model.body_mass, paper.model.body_mass)
 
 
-def test_actuators_have_the_original_order_ranges_and_gears():
-    ant = model_of("ant")
-    order = ["hip_4", "ankle_4", "hip_1", "ankle_1", "hip_2", "ankle_2", "hip_3", "ankle_3"]
-    assert [ant.actuator(i).name for i in range(ant.nu)] == order
-    assert set(ant.actuator_gear[:, 0]) == {30.0}
-    assert np.array_equal(ant.actuator_ctrlrange, np.tile([-1.0, 1.0], (8, 1)))
-    assert np.array_equal(model_of("hopper").actuator_ctrlrange, np.tile([-200.0, 200.0], (3, 1)))
-    assert np.array_equal(model_of("snake").actuator_ctrlrange, np.tile([-50.0, 50.0], (4, 1)))
-    assert model_of("half_cheetah").actuator_gear[:, 0].tolist() == [120, 90, 60, 120, 60, 30]
+@pytest.mark.parametrize(
+    ("robot", "joints", "limit", "gears"),
+    [
+        ("ant", "hip_4 ankle_4 hip_1 ankle_1 hip_2 ankle_2 hip_3 ankle_3", 1, [30] * 8),
+        ("snake", "rot2 rot3 rot4 rot5", 50, [1] * 4),
+        ("hopper", "thigh leg foot", 200, [1] * 3),
+        ("half_cheetah", "bthigh bshin bfoot fthigh fshin ffoot", 1, [120, 90, 60, 120, 60, 30]),
+    ],
+)
+def test_actuators_have_the_original_order_ranges_and_gears(robot, joints, limit, gears):
+    model = model_of(robot)
+    assert [model.joint(j).name for j in model.actuator_trnid[:, 0]] == joints.split()  # what is moved, not a name
+    assert model.actuator_gear[:, 0].tolist() == gears
+    assert model.actuator_ctrlrange.tolist() == [[-limit, limit]] * len(gears)
+    assert model.actuator_ctrllimited.all()
 
 
 def test_joint_ranges_damping_stiffness_and_armature():
     degrees = lambda model, name: np.degrees(model.joint(name).range).round(6).tolist()  # noqa: E731
     ant, hopper, cheetah = model_of("ant"), model_of("hopper"), model_of("half_cheetah")
-    assert degrees(ant, "hip_1") == [-30, 30]
+    assert [degrees(ant, f"hip_{i}") for i in (1, 2, 3, 4)] == [[-30, 30]] * 4
     assert [degrees(ant, f"ankle_{i}") for i in (1, 2, 3, 4)] == [[30, 70], [-70, -30], [-70, -30], [30, 70]]
-    assert degrees(model_of("snake"), "rot3") == [-100, 100]
+    assert [degrees(model_of("snake"), f"rot{i}") for i in (2, 3, 4, 5)] == [[-100, 100]] * 4
     assert degrees(hopper, "thigh") == degrees(hopper, "leg") == [-150, 0]
     assert degrees(hopper, "foot") == [-45, 45]
-    assert cheetah.joint("fshin").range.tolist() == [-1.2, 0.87]
+    ranges = [[-0.52, 1.05], [-0.785, 0.785], [-0.4, 0.785], [-1, 0.7], [-1.2, 0.87], [-0.5, 0.5]]
+    assert cheetah.jnt_range[3:].tolist() == ranges
+    for robot, free in (("ant", 1), ("snake", 3), ("hopper", 3), ("half_cheetah", 3)):  # the root's joints
+        limited = model_of(robot).jnt_limited.tolist()
+        assert limited == [0] * free + [1] * (len(limited) - free)
     assert cheetah.jnt_stiffness[3:].tolist() == [240, 180, 120, 180, 120, 60]
     assert cheetah.dof_damping.tolist() == [0, 0, 0, 6, 4.5, 3, 4.5, 3, 1.5]
     assert ant.dof_damping.tolist() == [0] * 6 + [1] * 8
@@ -143,10 +177,12 @@ def test_the_snake_touches_nothing_unless_its_walls_are_switched_on():
     assert x_of_head_after_a_push(walls=True) < 6.6
 
 
-def test_the_low_gear_ant_stays_alive_under_unit_noise():
-    env = make("ant_gather", 8, 0, physics="fast")
+@pytest.mark.parametrize("physics", ["paper", "fast"])
+def test_the_low_gear_ant_stays_alive_under_unit_noise(physics):
+    env = make("ant_gather", 8, 0, physics=physics)
     env.reset(seed=0)
-    rng = np.random.default_rng(0)
+    rng, start = np.random.default_rng(0), env.physics.qpos[:, :2].copy()
     for _ in range(300):
         _, _, terminated, _, _ = env.step(rng.standard_normal((8, 8)))
         assert not terminated.any()
+    assert (np.linalg.norm(env.physics.qpos[:, :2] - start, axis=1) > 1e-3).all()  # and it does move

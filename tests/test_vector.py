@@ -41,14 +41,18 @@ def test_a_seed_decides_everything_and_resets_differ(name):
 
 @everywhere
 def test_environment_i_of_many_is_environment_i_alone(name):
-    many, alone = make(name, 5, 0, horizon=6), make(name, 1, 0, horizon=6)
+    many = make(name, 8, 0, horizon=6)
     moves = actions(many, 10)
     obs, _ = many.reset(seed=11)
-    single, _ = alone.reset(seed=[14])
-    assert np.array_equal(obs[3], single[0])
-    for a in moves:
-        expected, got = many.step(a), alone.step(a[3:4])
-        assert all(np.array_equal(x[3], y[0]) for x, y in zip(expected[:4], got[:4], strict=True))
+    rows = played(many, moves)  # over one autoreset
+    for i in range(8):
+        alone = make(name, 1, 0, horizon=6)
+        single, _ = alone.reset(seed=[11 + i])
+        assert np.array_equal(obs[i], single[0])
+        for a, expected in zip(moves, rows, strict=True):
+            got = alone.step(a[i : i + 1])
+            assert all(np.array_equal(x[i], y[0]) for x, y in zip(expected[:4], got[:4], strict=True))
+    assert not np.array_equal(obs[0], obs[7])
 
 
 @everywhere
@@ -67,15 +71,43 @@ def test_at_the_horizon_the_last_observation_is_kept_and_the_next_episode_has_be
     assert info["_final_obs"].all()
     assert np.array_equal(info["final_obs"], expected[3][0])
     assert np.array_equal(reward, expected[3][1])
+    assert np.array_equal(obs, long.reset()[0])  # what a reset at this moment begins with
     assert not np.array_equal(obs, expected[3][0])
     assert np.array_equal(info["final_info"]["diverged"], [False] * 3)
     assert not short.step(moves[0])[3].any()  # the clock has started again
 
 
+def test_termination_and_truncation_are_apart_also_when_they_coincide():
+    # Ant 0 dies in step 1 of 3, ant 1 in the last step, ant 2 lives on to the horizon.
+    env = make("ant_gather", 3, 0, horizon=3)
+    env.reset(seed=0)
+    rows = []
+    for t in range(3):
+        if t != 1:
+            env.physics.qpos[t // 2, 2] = 5.0
+            env.physics.forward(np.arange(3))
+        rows.append(env.step(np.zeros((3, 8))))
+    assert [r[2].tolist() for r in rows] == [[True, False, False], [False] * 3, [False, True, False]]
+    assert [r[3].tolist() for r in rows] == [[False] * 3, [False] * 3, [False, False, True]]
+    assert [r[4].get("_final_obs", np.zeros(3, bool)).tolist() for r in rows] == [
+        [True, False, False],
+        [False] * 3,
+        [False, True, True],
+    ]
+    last, final = rows[2][0], rows[2][4]["final_obs"]
+    z = env.observation_names.index("z")
+    assert final[1, z] > 4
+    assert last[1, z] < 1  # reborn
+    assert np.array_equal(final[0], last[0])  # its episode goes on
+    assert not np.array_equal(final[2], last[2])
+    assert rows[2][4]["final_info"]["reward_death"].tolist() == [0.0, -10.0, 0.0]
+
+
+@pytest.mark.parametrize("layout_seed", [None, 5])
 @everywhere
-def test_continuation_from_a_state_is_bit_identical_also_in_another_environment(name):
+def test_continuation_from_a_state_is_bit_identical_also_in_another_environment(name, layout_seed):
     env = make(name, 3, 0, horizon=7)
-    env.reset(seed=1, options={"layout_seed": None})
+    env.reset(seed=1, options={"layout_seed": layout_seed})
     moves = actions(env, 20)
     played(env, moves[:5])
     state = env.get_state()
@@ -85,6 +117,11 @@ def test_continuation_from_a_state_is_bit_identical_also_in_another_environment(
     other = make(name, 3, 99, horizon=7)
     other.set_state(state)
     assert same(expected, played(other, moves[5:]))
+    for missing in ("rngs", "clock", "physics"):  # each part matters
+        fresh = make(name, 3, 99, horizon=7)
+        fresh.reset()
+        fresh.set_state(state | {missing: fresh.get_state()[missing]})
+        assert not same(expected, played(fresh, moves[5:]))
 
 
 @everywhere
@@ -110,10 +147,28 @@ def test_the_reward_is_the_sum_of_its_terms(options):
     total = 0.0
     for a in actions(env, 30):
         _, reward, _, _, info = env.step(a)
-        terms = sum(v for k, v in info.items() if k.startswith("reward_")) - info.get("velocity_penalty", 0.0)
-        np.testing.assert_allclose(reward, terms, rtol=0, atol=1e-15)
+        np.testing.assert_allclose(reward, sum_of_terms(info), rtol=0, atol=1e-15)
         total += np.abs(reward).sum()
     assert total >= 20  # two deaths at least
+
+
+def sum_of_terms(info):
+    return sum(v for k, v in info.items() if k.startswith("reward_")) - info.get("velocity_penalty", 0.0)
+
+
+@everywhere
+def test_the_reward_is_the_sum_of_its_terms_also_where_a_simulation_diverges(name):
+    env = make(name, 3, 0)
+    env.reset(seed=0)
+    if name.endswith("gather"):
+        env.task.objects[:, :8] = env._com[:, None, :2]  # eight apples to catch at once
+    else:
+        env.physics.qpos[:, 1 if name == "block_hopper" else 0] += 17.0  # eight walls behind
+        env.physics.forward(np.arange(3))
+    env.physics.qvel[2, 0] = np.nan
+    _, reward, _, _, info = env.step(np.zeros(env.action_space.shape))
+    assert reward.tolist() == [8.0, 8.0, 0.0]
+    assert sum_of_terms(info).tolist() == [8.0, 8.0, 0.0]
 
 
 @everywhere
@@ -121,9 +176,15 @@ def test_observations_have_their_dtype_and_stay_in_their_space(name):
     env = make(name, 4, 0)
     obs, _ = env.reset(seed=0)
     assert obs.dtype == np.float32
-    for a in actions(env, 40):
+    space = env.single_observation_space
+    assert np.isfinite(space.low).all()
+    assert np.isfinite(space.high).all()
+    wide = np.flatnonzero(space.high >= 1e3)  # bounds that only a diverging simulation meets
+    assert len(wide) >= env.robot_size - 4  # all of the robot but a quaternion
+    for a in actions(env, 100):
         obs, reward, terminated, truncated, _ = env.step(3 * a)
         assert env.observation_space.contains(obs)
+        assert (np.abs(obs[:, wide]) < 1e3).all()
         assert (reward.dtype, terminated.dtype, truncated.dtype) == (np.float64, bool, bool)
 
 
@@ -167,6 +228,11 @@ def test_bad_calls_are_refused():
         env.step(np.zeros((2, 4)))
     with pytest.raises(ValueError, match="1 non-finite"):
         env.step(np.array([[0.0, np.nan, 0.0], [0.0, 0.0, 0.0]]))
+    with pytest.raises(ValueError, match="2 non-finite"):
+        env.step(np.array([[0.0, np.inf, 0.0], [0.0, 0.0, -np.inf]]))
+    clean = make("block_hopper", 2, 0)
+    clean.reset(seed=0)
+    assert same([clean.step(np.ones((2, 3)))], [env.step(np.ones((2, 3)))])  # what was refused left no trace
     env.close()
     with pytest.raises(gym.error.ClosedEnvironmentError):
         env.reset()
