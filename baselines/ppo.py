@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -71,10 +72,10 @@ class PPOConfig:
     hidden_sizes: list[int] = setting([256, 64], "policy's hidden layers", paper="256, 64 (App. A)", low=1)
     value_hidden_sizes: list[int] = setting([32, 32], "hidden layers of the baseline", paper="2 x 32 (App. A)", low=1)
     value_iterations: int = setting(
-        20,
-        "loss evaluations of the baseline per iteration",
+        10,
+        "the most loss evaluations that the fit of a baseline may use per iteration",
         code="KL-constrained L-BFGS, up to 20 iterations x 10 penalties",
-        ours="one warm-started L-BFGS bounds the cost of an iteration",
+        ours="bounds the cost of an iteration; 20 explain the next batch no better (docs/performance.md)",
         low=1,
     )
 
@@ -109,23 +110,23 @@ def collect(
     """
     T, N = config.horizon, envs.num_envs
     steps = Steps(envs, T, config.bootstrap_horizon)
-    noise = torch.randn(steps.action.shape, generator=seeding.torch_generator(seed, "policy", iteration))
+    noise = torch.randn(steps.action.shape, generator=seeding.torch_generator(seed, "policy", iteration)).numpy()
     noise *= not greedy
-    is_decision = torch.empty(T, N, dtype=torch.bool)
-    action = torch.empty(N, steps.action.shape[-1])
-    steps_left = torch.zeros(N, dtype=torch.long)
-    steps.reset(seeding.integer(seed, "episodes", iteration))
+    is_decision = np.empty((T, N), bool)
+    action = np.empty((N, steps.action.shape[-1]), np.float32)
+    steps_left = np.zeros(N, np.int64)
+    act = policy.actor()
+    obs = steps.reset(seeding.integer(seed, "episodes", iteration))
     for t in range(T):
         is_decision[t] = steps_left == 0
-        where = is_decision[t].nonzero().squeeze(-1)
+        where = np.flatnonzero(is_decision[t])
         if len(where):
-            action[where] = policy.act(steps.obs[t][where], noise[t][where])
+            action[where] = act(obs[where], noise[t][where])
             steps_left[where] = config.action_repeat
-        steps.action[t] = action
-        done = steps.step(t)
+        obs, done = steps.step(t, action)
         steps_left -= 1
         steps_left[done] = 0
-    return steps, is_decision
+    return steps, torch.from_numpy(is_decision)
 
 
 def rollout(

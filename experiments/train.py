@@ -116,7 +116,7 @@ def mark_lost(run: Run, message: str) -> None:
     """Say in its status.json that the process that trained `run` is gone, unless another has taken the run over."""
     with contextlib.suppress(Timeout), FileLock(run.folder / ".lock", timeout=0):
         status = read_status(run.folder)
-        if status["state"] in ("running", "lost"):
+        if status["state"] not in ("finished", "diverged"):
             write_atomically(run.folder / "status.json", json.dumps(status | {"state": "lost", "message": message}))
 
 
@@ -154,8 +154,8 @@ def execute(run: Run) -> str:
     if read_status(run.folder)["state"] == "finished":
         print(f"{run.run_id} is finished: {run.folder}")
         return "finished"
-    if run.parent is not None and not _finish_parent(run.parent):
-        return "failed"
+    if run.parent is not None and (state := _finish_parent(run.parent)) != "finished":
+        return "preempted" if state == "preempted" else "failed"
     run.folder.mkdir(parents=True, exist_ok=True)
     try:
         with FileLock(run.folder / ".lock", timeout=0):
@@ -166,13 +166,13 @@ def execute(run: Run) -> str:
         return "running"
 
 
-def _finish_parent(parent: Run) -> bool:
-    """Train what a run depends on, or wait for whoever does; whether it is finished."""
+def _finish_parent(parent: Run) -> str:
+    """Train what a run depends on, or wait for whoever does; its final state."""
     while (state := execute(parent)) == "running":
         time.sleep(HEARTBEAT_SECONDS)
     if state != "finished":
         print(f"{parent.run_id}, which this run depends on, is {state}: {parent.folder}", file=sys.stderr)
-    return state == "finished"
+    return state
 
 
 def _execute_locked(run: Run) -> str:
@@ -210,7 +210,7 @@ def _manifest_with_history(run: Run) -> dict[str, Any]:
     old, new = before["git_commit"], content["git_commit"]
     where = "" if old == new else f" under commit {new[:10] or 'unknown'}, last under {old[:10] or 'unknown'}"
     print(f"resuming {run.run_id}{where}", flush=True)
-    return content | {"earlier_commits": [*before["earlier_commits"], old]}
+    return content | {"earlier_commits": [*before.get("earlier_commits", []), old]}
 
 
 @contextlib.contextmanager

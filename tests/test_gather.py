@@ -133,7 +133,7 @@ def test_every_cell_is_about_equally_likely():
 def at_objects(env, i, which):
     """Put objects `which` of simulation i on its robot and all others far away."""
     env.task.objects[i] = 50.0
-    env.task.objects[i, which] = env._com[i, :2]
+    env.task.objects[i, which] = env.physics.com[i, :2]
 
 
 def test_rewards_of_catching_add_up_and_nothing_comes_back():

@@ -22,7 +22,7 @@ def hierarchy(num_skills=3, horizon=12, num_envs=4, death_rate=0.1, spread=1.0, 
     policy = HierarchicalPolicy(config, size, size, size, torch.Generator().manual_seed(0))
     with torch.no_grad():
         policy.skills.first.weight[:, size + 1 :] *= spread
-        policy.skills.rest[1][-1].weight.mul_(spread)
+        policy.skills.rest[-1].weight.mul_(spread)
     batch = collect(policy, TargetEnv(num_envs, 0, horizon=horizon, death_rate=death_rate, size=size), config, 0, 0)
     return policy.double(), doubled(batch)
 
@@ -46,7 +46,7 @@ def test_exact_log_prob_equals_brute_force_enumeration_of_the_mixture():
                 product = float(manager[z])
                 for t in range(start, end):
                     x = policy.skill_input(obs[t, n], batch.time_left[t, n]).unsqueeze(0)
-                    mean = policy.skills.act(x, torch.tensor([z]), torch.zeros(1, 2, dtype=torch.float64))[0]
+                    mean = policy.skills.means(x)[0, z]
                     for d in range(2):
                         product *= math.exp(-0.5 * float(action[t, n, d] - mean[d]) ** 2) / math.sqrt(2 * math.pi)
                 terms.append(product)
@@ -74,10 +74,10 @@ def test_exact_equals_approximate_when_skills_have_disjoint_support():
     with torch.no_grad():  # skills 50 standard deviations apart, and the actions taken follow their own skill
         policy.skills.first.weight.zero_()
         policy.skills.first.weight[0, 3:6] = torch.tensor([-3.0, 0.0, 3.0])
-        for layer in policy.skills.rest[1][::2]:
+        for layer in policy.skills.rest[::2]:
             layer.weight.zero_()
-        policy.skills.rest[1][0].weight[0, 0] = 1.0
-        policy.skills.rest[1][2].weight[:, 0] = 100.0
+        policy.skills.rest[0].weight[0, 0] = 1.0
+        policy.skills.rest[2].weight[:, 0] = 100.0
     centre = 100 * math.tanh(math.tanh(3.0))
     own_mean = torch.tensor([-centre, 0.0, centre], dtype=torch.float64)[batch.skill[:-1]].unsqueeze(-1)
     batch.steps.action = own_mean + torch.randn(12, 4, 2, dtype=torch.float64)

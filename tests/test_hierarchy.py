@@ -113,7 +113,7 @@ def test_levels_hold_what_was_done_and_how_likely_it_was():
     own = everything[torch.arange(320), batch.skill[:-1].flatten()]
     torch.testing.assert_close(skill.log_prob(slice(None)).sort().values, own.sort().values)
     weighted = (skill.log_prob(slice(None)) * skill.advantage).sum()
-    torch.testing.assert_close(weighted, (own * 2 * advantage.flatten()).sum().float())
+    torch.testing.assert_close(weighted, (own * 2 * advantage.flatten()).sum().float(), rtol=1e-4, atol=1e-4)
     assert [lv.name for lv in levels(policy, batch, advantage, advantage, ["skill"])] == ["skill"]
 
 
@@ -121,9 +121,7 @@ def test_skills_do_not_see_beyond_the_robots_own_observation():
     config = HippoConfig(iterations=1, batch_size=40, horizon=40)
     policy = HierarchicalPolicy(config, 5, 3, 2, torch.Generator().manual_seed(0))
     obs = torch.randn(4, 5, requires_grad=True)
-    policy.skills.act(
-        policy.skill_input(obs, torch.ones(4)), torch.tensor([0, 1, 2, 3]), torch.zeros(4, 2)
-    ).sum().backward()
+    policy.skills.means(policy.skill_input(obs, torch.ones(4))).sum().backward()
     assert obs.grad[:, :3].abs().sum() > 0
     assert not obs.grad[:, 3:].any()
     full = HippoConfig(iterations=1, batch_size=40, horizon=40, skill_observation="full")

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from hippo.envs import ENVIRONMENTS, make
+from hippo.envs.mass_centre import MassCentre, hopper_features
 
 STEPS = {"ant_gather": 60, "snake_gather": 10, "block_hopper": 150, "block_half_cheetah": 100}
 
@@ -81,7 +82,7 @@ def test_derived_fields_are_those_of_the_new_state(name):
         env.step(np.full((2, model.nu), 0.7))
     mujoco.mj_setState(model, data, physics.get_state()[1], mujoco.mjtState.mjSTATE_INTEGRATION)
     mujoco.mj_forward(model, data)
-    com = physics.bind("subtree_com")[1, 1]
+    com = physics.com[1]
     np.testing.assert_allclose(com, data.subtree_com[1], rtol=0, atol=1e-12)
     for _ in range(physics.frame_skip):
         mujoco.mj_step(model, data)  # leaves the derived fields one physics step behind
@@ -122,3 +123,21 @@ def test_a_diverged_simulation_ends_alone(name, bad):
     assert np.isfinite(info["final_obs"]).all()
     assert info["_final_obs"].tolist() == [False, False, True, False]
     assert not np.array_equal(clean[6][0][2], injected[6][0][2])
+
+
+@pytest.mark.parametrize("name", ["ant_gather", "block_hopper"])
+def test_our_centre_of_mass_is_mujocos_also_under_changed_masses_and_any_quaternion(name):
+    options = {"perturbation": "mass", "strength": "all"} if name == "block_hopper" else {"perturbation": "mass"}
+    for chosen in ({}, options):
+        env = make(name, 50, 0, **chosen)
+        physics, rng = env.physics, np.random.default_rng(1)
+        physics.qpos[:] = rng.normal(size=physics.qpos.shape) * 2  # quaternions far from unit length included
+        ours = physics._mass_centre(physics.qpos)
+        physics.forward(np.arange(50))
+        np.testing.assert_allclose(ours, physics.bind("subtree_com")[:, 1], rtol=0, atol=1e-12)
+
+
+def test_features_that_do_not_span_the_centre_of_mass_are_refused():
+    model = make("block_hopper", 1, 0).physics.model
+    with pytest.raises(AssertionError, match="do not span"):
+        MassCentre(model, lambda qpos: hopper_features(qpos)[:, :-1], is_free=False)

@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 
@@ -10,6 +11,7 @@ from hippo.core.policies import (
     Manager,
     SkillLinear,
     SkillPolicy,
+    Tanh,
     gaussian_entropy,
     gaussian_log_prob,
     sample_categorical,
@@ -31,6 +33,12 @@ def test_gaussian_log_prob_and_entropy_are_those_of_the_distribution():
     assert float(gaussian_log_prob(zero, zero, zero)) == pytest.approx(-math.log(2 * math.pi), abs=1e-12)
 
 
+def test_our_tanh_and_its_gradient_are_torchs():
+    x = torch.linspace(-6, 6, 101, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(Tanh(), (x,))
+    torch.testing.assert_close(Tanh()(x), torch.tanh(x), rtol=0, atol=1e-15)
+
+
 @pytest.mark.parametrize("integration", ["bilinear", "concatenate"])
 def test_the_skill_layer_is_a_linear_layer_over_the_one_hot_input(integration):
     layer = SkillLinear(3, 4, 5, integration, generator()).double()
@@ -40,7 +48,6 @@ def test_the_skill_layer_is_a_linear_layer_over_the_one_hot_input(integration):
     product = (x.unsqueeze(2) * z.unsqueeze(1)).flatten(1)  # entry i Z + j is x_i z_j
     inputs = torch.cat([x, z, product] if integration == "bilinear" else [x, z], 1)
     expected = inputs @ layer.weight.T + layer.bias
-    torch.testing.assert_close(layer(x, skill), expected)
     torch.testing.assert_close(layer.grouped(x, [2, 1, 3, 1]), expected)
     torch.testing.assert_close(layer.all_skills(x)[torch.arange(7), skill], expected)
     if integration == "bilinear":
@@ -62,7 +69,9 @@ def test_the_three_log_probabilities_of_the_skill_policy_agree(per_skill):
     skill = torch.tensor([0, 0, 0, 1, 1, 2, 3, 3, 3])
     everything = policy.log_prob_all(obs, action)
     torch.testing.assert_close(policy.log_prob(obs, skill, action), everything[torch.arange(9), skill])
-    mean = policy.act(obs, skill, torch.zeros(9, 2, dtype=torch.float64))
+    mean = torch.from_numpy(policy.actor()(obs.numpy(), skill.numpy(), np.zeros((9, 2))))
+    noisy = torch.from_numpy(policy.actor()(obs.numpy(), skill.numpy(), np.ones((9, 2))))
+    torch.testing.assert_close(noisy - mean, policy.log_std().exp()[skill])
     torch.testing.assert_close(
         gaussian_log_prob(mean, policy.log_std()[skill], action), everything[torch.arange(9), skill]
     )
@@ -98,6 +107,19 @@ def test_the_standard_deviation_has_a_floor():
 
 def test_inverse_cdf_sampling_worked_by_hand():
     # Probabilities 0.2, 0.3, 0.5: u in [0, 0.2) -> 0, [0.2, 0.5) -> 1, [0.5, 1) -> 2.
-    logits = torch.tensor([0.2, 0.3, 0.5]).log().expand(6, 3)
-    uniform = torch.tensor([0.0, 0.19, 0.21, 0.49, 0.51, 0.9999999])
+    logits = np.log([[0.2, 0.3, 0.5]] * 6).astype(np.float32) + 7  # logits are known up to a constant
+    uniform = np.array([0.0, 0.19, 0.21, 0.49, 0.51, 0.9999999], np.float32)
     assert sample_categorical(logits, uniform).tolist() == [0, 0, 1, 1, 2, 2]
+
+
+def test_the_numpy_twins_of_manager_and_flat_policy_compute_what_torch_does():
+    obs = torch.randn(7, 5, generator=generator(1))
+    manager, flat = Manager(5, 3, [8, 6], generator()), GaussianPolicy(5, 2, [8, 6], generator())
+    np.testing.assert_allclose(manager.actor()(obs.numpy()), manager.logits(obs).detach(), rtol=1e-5, atol=1e-6)
+    action = flat.actor()(obs.numpy(), np.zeros((7, 2), np.float32))
+    assert action.dtype == np.float32
+    np.testing.assert_allclose(action, flat.mean(obs).detach(), rtol=1e-5, atol=1e-6)
+    with torch.no_grad():
+        flat.log_std_parameter.fill_(1.0)
+    moved = flat.actor()(obs.numpy(), np.ones((7, 2), np.float32)) - action
+    np.testing.assert_allclose(moved, np.full((7, 2), np.e), rtol=1e-5)

@@ -129,7 +129,7 @@ def test_initial_centres_of_mass():
         physics, model = env.physics, env.physics.model
         physics.reset(np.array([0]), model.qpos0[None], np.zeros((1, model.nv)))
         physics.forward(np.array([0]))
-        assert physics.bind("subtree_com")[0, 1] == pytest.approx(expected, abs=1e-4)
+        assert physics.com[0] == pytest.approx(expected, abs=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -159,7 +159,7 @@ def test_observation_entries_hold_what_their_names_say(name, entries):
         column = env.observation_names.index(entry)
         np.testing.assert_allclose(obs[:, column], getattr(env.physics, field)[:, index].astype(np.float32))
     if "com_x" in env.observation_names:
-        com = env.physics.bind("subtree_com")[:, 1, 0]
+        com = env.physics.com[:, 0]
         np.testing.assert_allclose(obs[:, env.observation_names.index("com_x")], com.astype(np.float32))
 
 

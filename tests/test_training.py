@@ -124,7 +124,7 @@ def test_with_one_skill_and_the_same_batch_hippos_skill_objective_is_flat_ppos()
     with torch.no_grad():
         flat.mean[0].weight.copy_(weight[0].T)
         flat.mean[0].bias.copy_(bias[0])
-        for mine, theirs in zip((flat.mean[2], flat.mean[4]), policy.skills.rest[1][::2], strict=True):
+        for mine, theirs in zip((flat.mean[2], flat.mean[4]), policy.skills.rest[::2], strict=True):
             mine.weight.copy_(theirs.weight)
             mine.bias.copy_(theirs.bias)
     batch = collect(policy, TargetEnv(10, 0), config, 0, 0)
@@ -140,7 +140,7 @@ def test_with_one_skill_and_the_same_batch_hippos_skill_objective_is_flat_ppos()
     assert results[0] == pytest.approx(results[1], abs=1e-6)
     # The gradient of what both networks share must agree, too.
     torch.testing.assert_close(policy.skills.log_std_parameter.grad[0], flat.log_std_parameter.grad)
-    torch.testing.assert_close(policy.skills.rest[1][0].weight.grad, flat.mean[2].weight.grad, rtol=1e-4, atol=1e-6)
+    torch.testing.assert_close(policy.skills.rest[0].weight.grad, flat.mean[2].weight.grad, rtol=1e-4, atol=1e-6)
 
 
 def test_hier_vpgs_step_is_the_first_step_of_hippo():

@@ -137,6 +137,20 @@ def test_returned_arrays_share_no_memory(name):
     assert np.array_equal(rows[0][0], kept)
 
 
+@everywhere
+def test_what_the_caller_does_to_returned_arrays_is_not_seen_by_the_environment(name):
+    for steps in (0, 1):  # the last finite observation comes from reset, then from step
+        env = make(name, 2, 0)
+        obs, _ = env.reset(seed=0)
+        for a in actions(env, steps):
+            obs = env.step(a)[0]
+        kept = obs.copy()
+        obs[:] = 7.0
+        env.physics.qvel[1, 0] = np.nan
+        info = env.step(np.zeros(env.action_space.shape))[4]
+        assert np.array_equal(info["final_obs"][1], kept[1])
+
+
 @pytest.mark.parametrize("options", [{}, {"velocity_penalty": True}])
 def test_the_reward_is_the_sum_of_its_terms(options):
     env = make("ant_gather", 6, 0, **options)
@@ -161,7 +175,7 @@ def test_the_reward_is_the_sum_of_its_terms_also_where_a_simulation_diverges(nam
     env = make(name, 3, 0)
     env.reset(seed=0)
     if name.endswith("gather"):
-        env.task.objects[:, :8] = env._com[:, None, :2]  # eight apples to catch at once
+        env.task.objects[:, :8] = env.physics.com[:, None, :2]  # eight apples to catch at once
     else:
         env.physics.qpos[:, 1 if name == "block_hopper" else 0] += 17.0  # eight walls behind
         env.physics.forward(np.arange(3))
@@ -200,6 +214,11 @@ def test_actions_are_clipped_and_mapped_to_the_controls():
     [
         ("ant_gatherer", {}, "env=ant_gatherer"),
         ("ant_gather", {"num_envs": 0}, "num_envs=0"),
+        ("ant_gather", {"num_envs": 2.0}, "num_envs=2.0"),
+        ("ant_gather", {"num_threads": 0}, "num_threads=0"),
+        ("ant_gather", {"seed": None}, "seed=None"),
+        ("ant_gather", {"seed": -1}, "seed=-1"),
+        ("ant_gather", {"seed": 2.5}, "seed=2.5"),
         ("ant_gather", {"horizon": 0}, "horizon=0"),
         ("ant_gather", {"wind": 1}, "wind=1"),
         ("ant_gather", {"physics": "slow"}, "physics=slow"),
@@ -219,6 +238,9 @@ def test_bad_calls_are_refused():
     env = make("block_hopper", 2, 0)
     with pytest.raises(gym.error.ResetNeeded):
         env.step(np.zeros((2, 3)))
+    for bad in (-1, 2.5, "a", True):
+        with pytest.raises(ValueError, match=f"layout_seed={bad}"):
+            env.reset(options={"layout_seed": bad})
     with pytest.raises(ValueError, match="wall_seed"):
         env.reset(options={"wall_seed": 1})
     with pytest.raises(ValueError, match="seed="):

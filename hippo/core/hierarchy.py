@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -74,10 +75,10 @@ class HierarchyConfig:
     skill_hidden_sizes: list[int] = setting([64, 64], "skill network's hidden layers", paper="2 x 64 (App. A)", low=1)
     value_hidden_sizes: list[int] = setting([32, 32], "hidden layers of both baselines", paper="2 x 32 (App. A)", low=1)
     value_iterations: int = setting(
-        20,
-        "loss evaluations per baseline and iteration",
+        10,
+        "the most loss evaluations that the fit of a baseline may use per iteration",
         code="KL-constrained L-BFGS, up to 20 iterations x 10 penalties",
-        ours="one warm-started L-BFGS bounds the cost of an iteration",
+        ours="bounds the cost of an iteration; 20 explain the next batch no better (docs/performance.md)",
         low=1,
     )
     skill_integration: str = setting(
@@ -161,13 +162,13 @@ class HierarchicalPolicy(nn.Module):
 class Commitment:
     """Which skill every environment is committed to, and for how many more steps (Algorithm 1, lines 4 to 10)."""
 
-    def __init__(self, num_envs: int) -> None:
-        self.skill = torch.zeros(num_envs, dtype=torch.long)  # (N,)
-        self.steps_left = torch.zeros(num_envs, dtype=torch.long)  # (N,)
+    def __init__(self, policy: HierarchicalPolicy, num_envs: int, period_max: int) -> None:
+        self.sees_time, self.period_max = policy.sees_time, period_max
+        self.logits = policy.manager.actor()
+        self.skill = np.zeros(num_envs, np.int64)  # (N,)
+        self.steps_left = np.zeros(num_envs, np.int64)  # (N,)
 
-    def renew(
-        self, policy: HierarchicalPolicy, obs: Tensor, period: Tensor, period_max: int, uniform: Tensor | None
-    ) -> Tensor:
+    def renew(self, obs: np.ndarray, period: np.ndarray, uniform: np.ndarray | None) -> np.ndarray:
         """Where a commitment has run out take the new `period` (N,), then let the manager choose.
 
         The period is drawn before the manager acts, so that the manager knows how long its choice will last. Without
@@ -177,15 +178,20 @@ class Commitment:
             (N,) bool, where a decision was made.
         """
         is_decision = self.steps_left == 0
-        where = is_decision.nonzero().squeeze(-1)
+        where = np.flatnonzero(is_decision)
         if len(where):
             self.steps_left[where] = period[where]
-            time_left = self.steps_left[where] / period_max
-            logits = policy.manager.logits(policy.manager_input(obs[where], time_left))
+            seen = np.concatenate([obs, self.time_left[:, None]], 1)[where] if self.sees_time else obs[where]
+            logits = self.logits(seen)
             self.skill[where] = logits.argmax(-1) if uniform is None else sample_categorical(logits, uniform[where])
         return is_decision
 
-    def advance(self, done: Tensor) -> None:
+    @property
+    def time_left(self) -> np.ndarray:
+        """(N,) steps left over the longest period, in (0, 1]."""
+        return (self.steps_left / self.period_max).astype(np.float32)
+
+    def advance(self, done: np.ndarray) -> None:
         """One environment step has passed; an episode's end cuts the commitment."""
         self.steps_left -= 1
         self.steps_left[done] = 0
@@ -220,30 +226,29 @@ def collect(
     T, N = config.horizon, envs.num_envs
     steps = Steps(envs, T, config.bootstrap_horizon)
     generator = seeding.torch_generator(seed, "period", iteration)
-    period = torch.randint(config.period_min, config.period_max + 1, (T + 1, N), generator=generator)
-    uniform = torch.rand(T + 1, N, generator=seeding.torch_generator(seed, "manager", iteration))
-    noise = torch.randn(steps.action.shape, generator=seeding.torch_generator(seed, "skills", iteration))
+    period = torch.randint(config.period_min, config.period_max + 1, (T + 1, N), generator=generator).numpy()
+    uniform = torch.rand(T + 1, N, generator=seeding.torch_generator(seed, "manager", iteration)).numpy()
+    noise = torch.randn(steps.action.shape, generator=seeding.torch_generator(seed, "skills", iteration)).numpy()
     noise *= not greedy
-    skill = torch.empty(T + 1, N, dtype=torch.long)
-    time_left = torch.empty(T + 1, N)
-    is_decision = torch.empty(T + 1, N, dtype=torch.bool)
+    skill = np.empty((T + 1, N), np.int64)
+    time_left = np.empty((T + 1, N), np.float32)
+    is_decision = np.empty((T + 1, N), bool)
 
-    commitment = Commitment(N)
-    steps.reset(seeding.integer(seed, "episodes", iteration))
+    act, view = policy.skills.actor(), policy.skill_view
+    commitment = Commitment(policy, N, config.period_max)
+    obs = steps.reset(seeding.integer(seed, "episodes", iteration))
     for t in range(T + 1):
-        obs = steps.obs[t]
-        chance = None if greedy else uniform[t]
-        is_decision[t] = commitment.renew(policy, obs, period[t], config.period_max, chance)
-        skill[t] = commitment.skill
-        time_left[t] = commitment.steps_left / config.period_max
+        is_decision[t] = commitment.renew(obs, period[t], None if greedy else uniform[t])
+        skill[t], time_left[t] = commitment.skill, commitment.time_left
         if t < T:
-            steps.action[t] = policy.skills.act(policy.skill_input(obs, time_left[t]), skill[t], noise[t])
-            commitment.advance(steps.step(t))
+            seen = np.concatenate([obs[:, :view], time_left[t, :, None]], 1) if policy.sees_time else obs[:, :view]
+            obs, done = steps.step(t, act(seen, skill[t], noise[t]))
+            commitment.advance(done)
 
-    used = torch.ones_like(steps.done)
+    decisions, used = torch.from_numpy(is_decision), torch.ones_like(steps.done)
     if config.truncate_to_period:
-        used = in_whole_periods(is_decision[:T], config.period_max)
-    return Batch(steps, skill, time_left, is_decision, used)
+        used = in_whole_periods(decisions[:T], config.period_max)
+    return Batch(steps, torch.from_numpy(skill), torch.from_numpy(time_left), decisions, used)
 
 
 def rollout(

@@ -6,12 +6,37 @@ deviations do not depend on the state.
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 MIN_STD = 1e-4  # floor of the standard deviation (authors' code)
+
+
+class _Tanh(torch.autograd.Function):
+    """tanh by numpy's vectorised routine: on a CPU ten times faster than torch's, and a third of an update's time."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor) -> Tensor:
+        y = torch.from_numpy(np.tanh(x.detach().numpy()))
+        ctx.save_for_backward(y)
+        return y
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> Tensor:
+        (y,), (gradient,) = ctx.saved_tensors, gradients
+        return torch.addcmul(gradient, gradient * y, y, value=-1)  # (1 - tanh^2) of the gradient
+
+
+class Tanh(nn.Module):
+    """The hidden activation of all policies."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Elementwise tanh."""
+        return _Tanh.apply(x)
 
 
 def linear(inputs: int, outputs: int, generator: torch.Generator) -> nn.Linear:
@@ -23,7 +48,7 @@ def linear(inputs: int, outputs: int, generator: torch.Generator) -> nn.Linear:
     return layer
 
 
-def mlp(sizes: Sequence[int], generator: torch.Generator, activation: type[nn.Module] = nn.Tanh) -> nn.Sequential:
+def mlp(sizes: Sequence[int], generator: torch.Generator, activation: type[nn.Module] = Tanh) -> nn.Sequential:
     """Layers sizes[0] -> ... -> sizes[-1] with `activation` between them and none after the last."""
     layers: list[nn.Module] = []
     for inputs, outputs in itertools.pairwise(sizes):
@@ -43,10 +68,26 @@ def gaussian_entropy(log_std: Tensor) -> Tensor:
     return log_std.sum(-1) + 0.5 * log_std.shape[-1] * (1 + math.log(2 * math.pi))
 
 
-def sample_categorical(logits: Tensor, uniform: Tensor) -> Tensor:
+def sample_categorical(logits: np.ndarray, uniform: np.ndarray) -> np.ndarray:
     """Inverse-CDF sample: logits (K, Z) and uniform (K,) in [0, 1) -> indices (K,)."""
-    cumulative = logits.softmax(-1).cumsum(-1)
-    return (uniform.unsqueeze(-1) >= cumulative).sum(-1).clamp_(max=logits.shape[-1] - 1)
+    cumulative = np.cumsum(np.exp(logits - logits.max(-1, keepdims=True)), -1)
+    return (uniform[:, None] * cumulative[:, -1:] >= cumulative).sum(-1).clip(max=logits.shape[-1] - 1)
+
+
+def for_few_rows(net: nn.Sequential) -> Callable[[np.ndarray], np.ndarray]:
+    """The function that an `mlp` with tanh computes now, in numpy, whose calls cost a third of torch's.
+
+    It shares memory with the parameters' current values and must not outlive them.
+    """
+    layers = [(m.weight.detach().numpy().T, m.bias.detach().numpy()) for m in net if isinstance(m, nn.Linear)]
+
+    def forward(x: np.ndarray) -> np.ndarray:
+        for i, (weight, bias) in enumerate(layers):
+            x = np.matmul(np.tanh(x, out=x) if i else x, weight)
+            x += bias
+        return x
+
+    return forward
 
 
 class GaussianPolicy(nn.Module):
@@ -68,9 +109,10 @@ class GaussianPolicy(nn.Module):
         """log pi(a|s): (B, D), (B, A) -> (B,)."""
         return gaussian_log_prob(self.mean(obs), self.log_std, action)
 
-    def act(self, obs: Tensor, noise: Tensor) -> Tensor:
-        """Action for standard normal `noise`: (N, D), (N, A) -> (N, A)."""
-        return self.mean(obs) + self.log_std.exp() * noise
+    def actor(self) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+        """A function from obs (N, D) and standard normal noise (N, A) to actions (N, A), for the current parameters."""
+        mean, std = for_few_rows(self.mean), self.log_std.exp().detach().numpy()
+        return lambda obs, noise: mean(obs) + std * noise
 
 
 class Manager(nn.Module):
@@ -79,6 +121,10 @@ class Manager(nn.Module):
     def __init__(self, obs_size: int, num_skills: int, hidden_sizes: Sequence[int], generator: torch.Generator) -> None:
         super().__init__()
         self.logits = mlp([obs_size, *hidden_sizes, num_skills], generator)
+
+    def actor(self) -> Callable[[np.ndarray], np.ndarray]:
+        """A function from what the manager sees (K, D) to logits (K, Z), for the current parameters."""
+        return for_few_rows(self.logits)
 
     def log_probs(self, obs: Tensor) -> Tensor:
         """log pi_h(.|s) of every skill: (B, D) -> (B, Z)."""
@@ -110,10 +156,6 @@ class SkillLinear(nn.Module):
         if self.integration == "bilinear":
             weight = weight + self.weight[:, D + Z :].view(-1, D, Z).permute(2, 1, 0)
         return weight.expand(Z, -1, -1), self.bias + self.weight[:, D : D + Z].T
-
-    def forward(self, x: Tensor, skill: Tensor) -> Tensor:
-        """Rows in any order: (B, D), (B,) -> (B, H). Computes every skill; meant for small batches."""
-        return self.all_skills(x)[torch.arange(len(x)), skill]
 
     def all_skills(self, x: Tensor) -> Tensor:
         """The layer under every skill: (B, D) -> (B, Z, H)."""
@@ -148,7 +190,8 @@ class SkillPolicy(nn.Module):
         super().__init__()
         self.num_skills = num_skills
         self.first = SkillLinear(obs_size, num_skills, hidden_sizes[0], integration, generator)
-        self.rest = nn.Sequential(nn.Tanh(), mlp([*hidden_sizes, action_size], generator))
+        self.after_first = Tanh()
+        self.rest = mlp([*hidden_sizes, action_size], generator)
         rows = num_skills if log_std_per_skill else 1
         self.log_std_parameter = nn.Parameter(torch.zeros(rows, action_size))
 
@@ -156,14 +199,26 @@ class SkillPolicy(nn.Module):
         """(Z, A) log standard deviation of every skill, floored."""
         return self.log_std_parameter.clamp(min=math.log(MIN_STD)).expand(self.num_skills, -1)
 
-    def act(self, obs: Tensor, skill: Tensor, noise: Tensor) -> Tensor:
-        """Action for standard normal `noise`: (N, D), (N,), (N, A) -> (N, A)."""
-        return self.rest(self.first(obs, skill)) + self.log_std().exp()[skill] * noise
+    def actor(self) -> Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]:
+        """A function from obs (N, D), skill (N,) and standard normal noise (N, A) to actions (N, A).
+
+        For the current parameters. The first layer is computed for every skill, as one product, and then selected.
+        """
+        weight, bias = (x.detach().numpy() for x in self.first.effective())  # (Z, D, H), (Z, H)
+        flat = np.ascontiguousarray(weight.transpose(1, 0, 2).reshape(self.first.inputs, -1))
+        rest, std = for_few_rows(self.rest), self.log_std().exp().detach().numpy()
+
+        def act(obs: np.ndarray, skill: np.ndarray, noise: np.ndarray) -> np.ndarray:
+            hidden = np.matmul(obs, flat).reshape(len(obs), len(bias), -1)[np.arange(len(obs)), skill]
+            hidden += bias[skill]
+            return rest(np.tanh(hidden, out=hidden)) + std[skill] * noise
+
+        return act
 
     def log_prob(self, obs: Tensor, skill: Tensor, action: Tensor) -> Tensor:
         """log pi_l(a|s, z) of rows *sorted by skill*: (B, D), (B,), (B, A) -> (B,)."""
         counts = torch.bincount(skill, minlength=self.num_skills).tolist()
-        mean = self.rest(self.first.grouped(obs, counts))
+        mean = self.rest(self.after_first(self.first.grouped(obs, counts)))
         return gaussian_log_prob(mean, self.log_std()[skill], action)
 
     def log_prob_all(self, obs: Tensor, action: Tensor) -> Tensor:
@@ -172,4 +227,4 @@ class SkillPolicy(nn.Module):
 
     def means(self, obs: Tensor) -> Tensor:
         """Mean action of every skill: (B, D) -> (B, Z, A)."""
-        return self.rest(self.first.all_skills(obs))
+        return self.rest(self.after_first(self.first.all_skills(obs)))

@@ -108,7 +108,7 @@ class Blocks:
     def attach(self, physics: BatchPhysics) -> None:
         """Take views of what the task reads from and writes to the simulations."""
         self.physics = physics
-        self.com = physics.bind("subtree_com")[:, 1]
+        self.com = physics.com
 
     @property
     def entries(self) -> list[tuple[str, str, float, float]]:
@@ -142,7 +142,7 @@ class Blocks:
         reward = (cleared - self.cleared).astype(np.float64)
         self.cleared = cleared
         terminated = self._fallen() if self.terminate_on_fall else np.zeros(len(x), bool)
-        return reward, terminated, {"reward_walls": reward}
+        return reward.copy(), terminated, {"reward_walls": reward}
 
     def _fallen(self) -> np.ndarray:
         """rllab's termination: the Hopper must stay up; the Half-Cheetah never ends."""

@@ -121,7 +121,7 @@ class Gather:
     def attach(self, physics: BatchPhysics) -> None:
         """Take views of what the task reads from the simulations."""
         self.physics = physics
-        self.com = physics.bind("subtree_com")[:, 1]
+        self.com = physics.com
         self.com_velocity = physics.bind("sensordata") if self.penalty is not None else None
 
     @property

@@ -4,6 +4,8 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
+from hippo.envs.mass_centre import MassCentre
+
 MAX_SPEED = 1e4  # |qvel| beyond this, in m/s or rad/s, is a diverged simulation (ours)
 
 
@@ -11,17 +13,32 @@ class BatchPhysics:
     """N simulations stepped together, bit-identical to a plain `mj_step` loop at any number of threads.
 
     `qpos` (N, nq), `qvel` (N, nv), `ctrl` (N, nu) and, with mocap bodies, `mocap_pos` (N, nmocap, 3) are live views of
-    the simulations' states. Derived fields bound with `bind` hold the *new* state after `step` and `reset`.
+    the simulations' states. `com` (N, 3) is the whole robot's centre of mass in the *new* state after `step` and
+    `forward`, and so are the derived fields bound with `bind`, unless `mass_centre` is given.
+
+    Args:
+        mass_centre: computes the centre of mass from qpos, so that nothing is asked of MuJoCo after a step.
     """
 
-    def __init__(self, model: mujoco.MjModel, num_envs: int, frame_skip: int, num_threads: int = 1) -> None:
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        num_envs: int,
+        frame_skip: int,
+        num_threads: int = 1,
+        mass_centre: MassCentre | None = None,
+    ) -> None:
         # MuJoCo would reset a diverged simulation silently.
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         self.model, self.num_envs, self.frame_skip = model, num_envs, frame_skip
-        # A persistent batch goes on from the stages computed at the new state, so asking for them costs nothing.
-        self._batch = Batch(model, num_envs, num_threads, persistent=True)
+        self._mass_centre = mass_centre
+        self._stage = mujoco.mjtStage.mjSTAGE_VEL if mass_centre is None else mujoco.mjtStage.mjSTAGE_NONE
+        # A persistent batch goes on from the stages computed at the new state, so asking for them costs nothing (but
+        # with RK4 it does, see mass_centre.py).
+        self._batch = Batch(model, num_envs, num_threads, persistent=mass_centre is None)
         self.qpos, self.qvel = self._batch.bind("qpos"), self._batch.bind("qvel")
         self.ctrl, self.mocap_pos = self._batch.bind("ctrl"), self._batch.bind("mocap_pos")
+        self.com, self._subtree_com = np.zeros((num_envs, 3)), self._batch.bind("subtree_com")
         self._initial = np.zeros(self._batch.nstate)
         self._batch.reset(stage=mujoco.mjtStage.mjSTAGE_NONE)
         self._initial[:] = self._batch.state[0]
@@ -32,7 +49,8 @@ class BatchPhysics:
 
     def step(self) -> None:
         """Advance every simulation by one control step of `frame_skip` physics steps."""
-        self._batch.step(nstep=self.frame_skip, stage=mujoco.mjtStage.mjSTAGE_VEL)
+        self._batch.step(nstep=self.frame_skip, stage=self._stage)
+        self._update_com()
 
     def reset(self, ids: np.ndarray, qpos: np.ndarray, qvel: np.ndarray) -> None:
         """Put simulations `ids` (n,) into the model's initial state, but at `qpos` (n, nq) and `qvel` (n, nv)."""
@@ -42,6 +60,11 @@ class BatchPhysics:
     def forward(self, ids: np.ndarray) -> None:
         """Compute the derived fields of simulations `ids` (n,) after their state was written."""
         self._batch.forward(ids, stage=mujoco.mjtStage.mjSTAGE_VEL)
+        self._update_com()
+
+    def _update_com(self) -> None:
+        with np.errstate(invalid="ignore"):  # a diverged simulation is found by its state
+            self.com[:] = self._subtree_com[:, 1] if self._mass_centre is None else self._mass_centre(self.qpos)
 
     def diverged(self) -> np.ndarray:
         """(N,) bool: a position or velocity is not finite, or a velocity is beyond MAX_SPEED."""

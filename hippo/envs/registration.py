@@ -66,12 +66,11 @@ def make(
     """
     if name not in ENVIRONMENTS:
         raise ValueError(f"env={name}: must be one of {', '.join(ENVIRONMENTS)}")
-    if num_envs < 1:
-        raise ValueError(f"num_envs={num_envs}: must be at least 1")
     environment = ENVIRONMENTS[name]
     horizon = environment.horizon if horizon is None else horizon
-    if horizon < 1:
-        raise ValueError(f"horizon={horizon}: must be at least 1")
+    for key, number in (("num_envs", num_envs), ("horizon", horizon), ("num_threads", num_threads)):
+        if isinstance(number, bool) or not isinstance(number, int) or number < 1:
+            raise ValueError(f"{key}={number}: must be an integer of at least 1")
     for key, value in options.items():
         check_option(name, key, value)
     return RobotTaskEnv(

@@ -10,6 +10,8 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
+from hippo.envs.mass_centre import Features, ant_features, hopper_features
+
 ASSETS = Path(__file__).parent / "assets"
 POSITION, VELOCITY, ANGLE = 1e3, 1e3, 1e3  # finite bounds of an observation: m, m/s or rad/s, rad
 
@@ -44,6 +46,7 @@ class Robot:
     fast: Timing | None  # a cheaper integrator, ours; None where the paper's is already cheap
     observations: dict[str, tuple[Quantity, ...]]  # variant -> what is observed; the first is the default
     yaw: Callable[[np.ndarray], np.ndarray] | None  # qpos (N, nq) -> heading (N,) in rad, where a task needs it
+    com_features: Features | None = None  # see mass_centre.py; where the integrator makes MuJoCo's own slow to ask for
 
     def spec(self, physics: str) -> mujoco.MjSpec:
         """The editable model with the time step of `physics`, "paper" or "fast"."""
@@ -102,6 +105,7 @@ ANT = Robot(
         )
     },
     quaternion_yaw,
+    ant_features,
 )
 SNAKE = Robot(
     "snake",
@@ -136,6 +140,7 @@ HOPPER = Robot(
         )
     },
     None,
+    hopper_features,
 )
 HALF_CHEETAH = Robot(
     "half_cheetah",

@@ -4,8 +4,10 @@ from collections.abc import Sequence
 from typing import Any
 
 import gymnasium as gym
+import mujoco
 import numpy as np
 
+from hippo.envs.mass_centre import MassCentre
 from hippo.envs.perturb import perturb
 from hippo.envs.physics import BatchPhysics
 from hippo.envs.robots import Robot
@@ -45,9 +47,11 @@ class RobotTaskEnv(gym.vector.VectorEnv):
         if options.perturbation is not None:
             perturb(spec, robot.name, options.perturbation, options.strength)
         model = spec.compile()
-        self.physics = BatchPhysics(model, num_envs, robot.timing(options.physics).frame_skip, num_threads)
+        timing, centre = robot.timing(options.physics), None
+        if robot.com_features is not None and timing.integrator == mujoco.mjtIntegrator.mjINT_RK4 and not model.nsensor:
+            centre = MassCentre(model, robot.com_features, is_free=model.jnt_type[0] == mujoco.mjtJoint.mjJNT_FREE)
+        self.physics = BatchPhysics(model, num_envs, timing.frame_skip, num_threads, centre)
         self.task.attach(self.physics)
-        self._com = self.physics.bind("subtree_com")[:, 1]
 
         self.quantities = robot.observations[options.observation]
         entries = [
@@ -74,7 +78,12 @@ class RobotTaskEnv(gym.vector.VectorEnv):
         self._seed(seed)
 
     def _seed(self, seed: int | Sequence[int | None]) -> None:
-        seeds = [seed + i for i in range(self.num_envs)] if isinstance(seed, int | np.integer) else list(seed)
+        if isinstance(seed, Sequence):
+            seeds = [_natural("seed", s, may_be_none=True) for s in seed]
+        else:
+            first = _natural("seed", seed)
+            assert first is not None
+            seeds = [first + i for i in range(self.num_envs)]
         if len(seeds) != self.num_envs:
             raise ValueError(f"seed={seed}: give one integer or {self.num_envs} of them")
         rngs = getattr(self, "_rngs", [None] * self.num_envs)
@@ -98,7 +107,7 @@ class RobotTaskEnv(gym.vector.VectorEnv):
         if unknown:
             raise ValueError(f"reset option {sorted(unknown)[0]}: the only one is layout_seed")
         if options is not None and "layout_seed" in options:
-            self._layout_seed = options["layout_seed"]
+            self._layout_seed = _natural("layout_seed", options["layout_seed"], may_be_none=True)
         if seed is not None:
             self._seed(seed)
         self._started = True
@@ -164,7 +173,7 @@ class RobotTaskEnv(gym.vector.VectorEnv):
 
     def _observe(self) -> np.ndarray:
         """(N, D) float32 observation of the current state, within its bounds."""
-        sources = {"qpos": self.physics.qpos, "qvel": self.physics.qvel, "com": self._com}
+        sources = {"qpos": self.physics.qpos, "qvel": self.physics.qvel, "com": self.physics.com}
         parts = [sources[q.source][:, q.index[0] : q.index[-1] + 1] for q in self.quantities]
         obs = np.concatenate([*parts, self.task.observe()], 1).astype(np.float32)
         return np.clip(obs, self._low, self._high, out=obs)
@@ -208,3 +217,12 @@ class RobotTaskEnv(gym.vector.VectorEnv):
     def _check_open(self) -> None:
         if self.closed:
             raise gym.error.ClosedEnvironmentError("this environment is closed")
+
+
+def _natural(name: str, value: Any, may_be_none: bool = False) -> int | None:
+    """`value` if it is an integer of at least 0 (or None where that is allowed); a ValueError that names it if not."""
+    if value is None and may_be_none:
+        return None
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 0:
+        raise ValueError(f"{name}={value}: must be an integer of at least 0{' or None' if may_be_none else ''}")
+    return int(value)

@@ -1,0 +1,176 @@
+"""Sweeps and runs that meet each other, are stopped, diverge or find damage."""
+
+import dataclasses
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from experiments import launchers, sweep, train
+from experiments.config import compose_run
+
+ROOT = Path(__file__).parent.parent
+TINY = ["env=block_hopper", "scale=smoke", "iterations=2", "batch_size=400"]
+FIGURE = {
+    "title": "tiny",
+    "environments": ["block_hopper"],
+    "variants": {"hippo": {"label": "HiPPO", "algo": "hippo"}, "ppo": {"label": "PPO", "algo": "ppo"}},
+}
+SCRIPT = f"""
+if __name__ == "__main__":  # workers import this file again
+    import sys
+    from experiments import sweep
+    sweep.load_figure = lambda name: {FIGURE!r}
+    sys.exit(sweep.main(sys.argv[1:]))
+"""
+
+
+def start_sweep(tmp_path, iterations):
+    """A sweep of four runs in a process of its own."""
+    script = tmp_path / "tiny_sweep.py"
+    script.write_text(SCRIPT)
+    arguments = ["run", "tiny", "--runs-dir", str(tmp_path / "runs"), "--workers", "2"]
+    settings = ["--set", f"iterations={iterations}", "--set", "batch_size=400"]
+    return subprocess.Popen(
+        [sys.executable, str(script), *arguments, *settings],
+        cwd=ROOT,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+@pytest.fixture
+def tiny_run(tmp_path):
+    return compose_run([*TINY, f"runs_dir={tmp_path}"])
+
+
+@pytest.fixture
+def tiny_figure(monkeypatch):
+    monkeypatch.setattr(sweep, "load_figure", lambda name: FIGURE)
+
+
+def test_two_sweeps_started_together_train_every_run_once_and_both_succeed(tmp_path):
+    both = [start_sweep(tmp_path, 6) for _ in range(2)]
+    errors = [process.communicate(timeout=100)[1] for process in both]
+    assert [process.returncode for process in both] == [0, 0], errors
+    folders = [path.parent for path in (tmp_path / "runs").glob("*/status.json")]
+    assert len(folders) == 4
+    for folder in folders:
+        assert json.loads((folder / "status.json").read_text())["state"] == "finished"
+        assert (folder / "train.log").read_text().count("iteration 6/6") == 1
+        assert (folder / "progress.csv").read_text().count("\n") == 7
+    assert not list((tmp_path / "runs").rglob("*.tmp"))
+
+
+def test_a_terminated_sweep_leaves_every_run_resumable_and_no_orphan(tmp_path):
+    process = start_sweep(tmp_path, 2000)
+    deadline = time.monotonic() + 60
+    while not list((tmp_path / "runs").glob("*/checkpoint.pt")) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    process.send_signal(signal.SIGTERM)
+    _, error = process.communicate(timeout=40)
+    assert process.returncode == train.EXIT_REQUEUE
+    assert "the same command continues" in error
+    states = [json.loads(path.read_text()) for path in (tmp_path / "runs").glob("*/status.json")]
+    assert {status["state"] for status in states} == {"preempted"}
+    assert not any(Path(f"/proc/{status['pid']}").exists() for status in states)
+
+
+def test_a_diverged_run_is_reported_and_not_trained_again(tiny_figure, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(sweep, "run_locally", lambda runs, *_: {run.run_id: "finished" for run in runs})
+    arguments = ["tiny", "--runs-dir", str(tmp_path)]
+    run = sweep.make_plan("tiny", "smoke", [], False, tmp_path).entries[0].run
+    run.folder.mkdir()
+    (run.folder / "status.json").write_text(json.dumps({"state": "diverged", "message": "iteration 1: a NaN"}))
+    assert sweep.main(["run", *arguments]) == train.EXIT_FAILED
+    captured = capsys.readouterr()
+    assert "to train: 3 runs" in captured.out
+    assert captured.err.startswith("diverged: block_hopper hippo seed 0: iteration 1: a NaN")
+
+
+@pytest.mark.parametrize("key", sweep.FIXED)
+def test_what_the_plan_decides_cannot_be_set(key, tiny_figure, tmp_path, capsys):
+    assert sweep.main(["run", "tiny", "--runs-dir", str(tmp_path / "runs"), "--set", f"{key}=1"]) == 2
+    assert f"set {key}=1" in capsys.readouterr().err
+    assert not (tmp_path / "runs").exists()
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [("runs_dir=", "runs_dir=: must name a folder"), ("=3", "=3: settings are"), ("budget=3", "valid: ")],
+)
+def test_overrides_that_name_nothing_are_refused(override, message, capsys):
+    assert train.main([*TINY, override]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_a_lost_process_leaves_its_cause_unless_the_run_was_taken_over_or_is_done(tiny_run):
+    def state():
+        return train.read_status(tiny_run.folder)["state"]
+
+    tiny_run.folder.mkdir(exist_ok=True)
+    train.Status(tiny_run).update()
+    with train.FileLock(tiny_run.folder / ".lock"):  # another process trains it
+        train.mark_lost(tiny_run, "killed")
+    assert state() == "running"
+    train.mark_lost(tiny_run, f"its process ended: {launchers.cause(-signal.SIGKILL)}")
+    assert state() == "lost"
+    assert train.read_status(tiny_run.folder)["message"] == "its process ended: SIGKILL"
+    train.Status(tiny_run).update(state="finished")
+    train.mark_lost(tiny_run, "killed")
+    assert state() == "finished"
+
+
+def test_a_process_that_ends_before_its_run_began_leaves_its_cause(tiny_run):
+    train.mark_lost(tiny_run, launchers.cause(1))
+    status = train.read_status(tiny_run.folder)
+    assert (status["state"], status["message"]) == ("lost", "exit code 1")
+
+
+def test_a_damaged_status_is_lost_and_the_run_trains_all_the_same(tiny_run):
+    tiny_run.folder.mkdir(exist_ok=True)
+    (tiny_run.folder / "status.json").write_text("")
+    assert train.read_status(tiny_run.folder)["state"] == "lost"
+    assert train.execute(tiny_run) == "finished"
+
+
+def test_damaged_checkpoints_end_the_run_with_one_line_and_no_traceback(tiny_run, capsys):
+    assert train.execute(tiny_run) == "finished"
+    train.Status(tiny_run).update(state="running")
+    for name in ("checkpoint.pt", "checkpoint.prev.pt"):
+        (tiny_run.folder / name).write_bytes(b"no checkpoint")
+    assert train.execute(tiny_run) == "failed"
+    error = capsys.readouterr().err
+    assert "no intact checkpoint" in error
+    assert "Traceback" not in error
+    assert "no intact checkpoint" in train.read_status(tiny_run.folder)["message"]
+
+
+def test_resuming_under_another_commit_is_announced_and_both_commits_are_kept(tiny_run, capsys):
+    assert train.execute(tiny_run) == "finished"
+    path = tiny_run.folder / "manifest.json"
+    manifest = json.loads(path.read_text())
+    assert manifest["earlier_commits"] == []
+    path.write_text(json.dumps(manifest | {"git_commit": "0" * 40}))
+    train.Status(tiny_run).update(state="preempted")
+    assert train.execute(tiny_run) == "finished"
+    assert "last under 0000000000" in capsys.readouterr().out
+    resumed = json.loads(path.read_text())
+    assert resumed["earlier_commits"] == ["0" * 40]
+    assert resumed["git_commit"] == manifest["git_commit"]
+
+
+def test_a_run_whose_parent_was_preempted_is_preempted_too(tiny_run, monkeypatch):
+    child = dataclasses.replace(tiny_run, kind="measure")
+    monkeypatch.setattr(train, "_finish_parent", lambda parent: "preempted")
+    assert child.parent is not None
+    assert train.execute(child) == "preempted"
+    monkeypatch.setattr(train, "_finish_parent", lambda parent: "diverged")
+    assert train.execute(child) == "failed"
