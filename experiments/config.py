@@ -138,8 +138,9 @@ class Run:
 
     @property
     def env_steps(self) -> int:
-        """Environment steps that the whole run takes."""
-        return self.config.iterations * self.config.num_envs * self.config.horizon
+        """Environment steps that the whole run takes, without its parent's; a measurement takes two batches."""
+        batches = self.config.iterations if self.kind == "train" else 2
+        return batches * self.config.num_envs * self.config.horizon
 
     @property
     def estimated_seconds(self) -> float:

@@ -58,6 +58,12 @@ class Plan:
         """Runs that still have to be trained, each once; a diverged one would only diverge again."""
         return list({e.run.run_id: e.run for e in self.entries if e.state not in (*DONE, "diverged")}.values())
 
+    def to_pay(self) -> list[Run]:
+        """`todo` and the parents that its runs will have to train first, each once."""
+        parents = [run.parent for run in self.todo() if run.parent is not None]
+        unfinished = [run for run in parents if read_status(run.folder)["state"] != "finished"]
+        return list({run.run_id: run for run in [*self.todo(), *unfinished]}.values())
+
     def write(self, runs_dir: Path) -> Path:
         """Write the plan for analysis and drawing, which read nothing else but run folders and committed rows."""
         path = runs_dir / "plans" / self.scale / f"{self.figure}.json"
@@ -135,8 +141,7 @@ def summary(plan: Plan) -> str:
     runs = {e.run.run_id: e for e in plan.entries}
     states = sorted({e.state for e in runs.values()})
     counts = ", ".join(f"{sum(e.state == state for e in runs.values())} {state}" for state in states)
-    todo = plan.todo()
-    cost = sum(run.estimated_seconds for run in todo)
+    todo, cost = plan.to_pay(), sum(run.estimated_seconds for run in plan.to_pay())
     return (
         f"{plan.figure} at scale {plan.scale}: {len(runs)} runs ({counts}); to train: {len(todo)} runs, "
         f"{sum(run.env_steps for run in todo):,} environment steps, about {duration(cost)} on one core"
@@ -173,8 +178,8 @@ def train_all(todo: Sequence[Run], workers: int, report: Callable[[int, int], No
 def run_figure(plan: Plan, workers: int, runs_dir: Path) -> int:
     """Train what is missing; returns the exit code."""
     todo, started, last_report = plan.todo(), time.monotonic(), time.monotonic()
-    total = sum(run.estimated_seconds for run in todo)
-    by_id = {run.run_id: run for run in todo}
+    by_id = {run.run_id: run for run in plan.to_pay()}
+    total = sum(run.estimated_seconds for run in by_id.values())
     begun = {i: read_status(run.folder).get("iteration", -1) + 1 for i, run in by_id.items()}
 
     def progress() -> float:
@@ -266,7 +271,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if options.workers < 1:
             raise ConfigError("workers", options.workers, "must be at least 1")
         plan = make_plan(options.figure, options.scale, options.set, options.fresh, options.runs_dir)
-        cost = sum(run.estimated_seconds for run in plan.todo()) / 3600
+        cost = sum(run.estimated_seconds for run in plan.to_pay()) / 3600
         if options.action == "run" and cost > options.max_core_hours and not options.yes:
             valid = f"below the estimate of {cost:,.0f}; raise it or agree with --yes (make ... YES=1)"
             raise ConfigError("max-core-hours", options.max_core_hours, valid)

@@ -283,6 +283,9 @@ def test_a_measurement_trains_its_parent_first_and_shares_it(tmp_path, capsys):
     parents = {p.name for p in tmp_path.iterdir() if (p / "checkpoint.pt").exists()}
     assert len(parents) == len(ids) == 8
     assert not parents & ids
+    # Paid for: 8 runs of one batch (400 steps, the Snake's too), and 8 measurements of two.
+    again = sweep.make_plan("table2", "smoke", settings[1::2], False, tmp_path / "elsewhere")
+    assert (len(again.todo()), sum(run.env_steps for run in again.to_pay())) == (8, 8 * 400 + 8 * 800)
     (row,) = (tmp_path / min(ids) / "progress.csv").read_text().splitlines()[1:]
     assert row.startswith("1,")  # the batch after one iteration of training
     run = compose_run(["env=ant_gather", "scale=smoke", *settings[1::2], f"runs_dir={tmp_path}"])
