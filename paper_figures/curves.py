@@ -1,6 +1,5 @@
 """Learning curves: a panel per environment, a line per method, every seed visible; shared by figures 3 to 9."""
 
-import argparse
 import hashlib
 import sys
 from collections.abc import Callable, Sequence
@@ -14,9 +13,8 @@ from matplotlib.lines import Line2D
 
 from analysis import stats
 from analysis.runs import MissingData, Results, load, scores
-from paper_figures import style
+from paper_figures import command_line, style
 
-HERE = Path(__file__).parent
 NOT_A_RESULT = {"smoke": "smoke"}  # scales whose pictures say nothing about the methods
 
 
@@ -136,12 +134,7 @@ def draw(results: Results, out: Path, extra: Extra | None = None) -> list[Path]:
 
 def main(figure: str, arguments: Sequence[str] | None = None, extra: Extra | None = None) -> int:
     """Draw one figure from the command line; exit code 2 where there is nothing to draw."""
-    parser = argparse.ArgumentParser(prog=f"paper_figures.{figure}", description=f"Draw {figure}.")
-    parser.add_argument("--scale", default="smoke", help="smoke, laptop or paper")
-    parser.add_argument("--runs-dir", type=Path, default=Path("runs"))
-    parser.add_argument("--data", type=Path, default=HERE / "data", help="committed results")
-    parser.add_argument("--out", type=Path, default=HERE / "out")
-    options = parser.parse_args(arguments)
+    options = command_line.parse(figure, arguments)
     try:
         metrics = ("return_mean", *(extra.metrics if extra is not None else ()))
         results = load(figure, options.scale, options.runs_dir, options.data, metrics)

@@ -4,7 +4,6 @@ Means over seeds of what each seed's batch gives; the standard deviation is over
 does not say what it calls the probability of a continuous action, so every definition is a row.
 """
 
-import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,6 +12,7 @@ import pandas as pd
 import yaml
 
 from analysis.runs import MissingData, Results, load
+from paper_figures import command_line
 
 HERE = Path(__file__).parent
 COSINES = {
@@ -99,12 +99,7 @@ def latex(table: list[dict[str, str]], results: Results) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Write table2.csv, .md and .tex, and print the table."""
-    parser = argparse.ArgumentParser(prog="paper_figures.table2", description="Make Table 2.")
-    parser.add_argument("--scale", default="smoke", help="smoke, laptop or paper")
-    parser.add_argument("--runs-dir", type=Path, default=Path("runs"))
-    parser.add_argument("--data", type=Path, default=HERE / "data", help="committed results")
-    parser.add_argument("--out", type=Path, default=HERE / "out")
-    options = parser.parse_args(arguments)
+    options = command_line.parse("table2", arguments)
     try:
         results = load("table2", options.scale, options.runs_dir, options.data, metrics=None)
     except (MissingData, ValueError) as error:
