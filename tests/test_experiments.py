@@ -32,7 +32,7 @@ def command(*arguments, module="experiments.train", **options):
 def test_a_run_is_named_by_what_decides_its_numbers():
     base = compose_run(TINY)
     assert re.fullmatch("[0-9a-f]{12}", base.run_id)
-    same = [[*TINY, "runs_dir=elsewhere"], [*TINY, "wandb.mode=offline"], [*TINY, "algo.gamma=0.999"]]
+    same = [[*TINY, "runs_dir=elsewhere"], [*TINY, "algo.gamma=0.999"]]
     assert {compose_run(s).run_id for s in same} == {base.run_id}
     different = [
         [*TINY, "seed=1"],
@@ -93,7 +93,7 @@ WRONG = [
     (["env.walls=true"], "env.walls=True"),
     (["algo.num_skills=2.5"], "algo.num_skills=2.5"),
     (["algo.skill_hidden_sizes=[64,a]"], "algo.skill_hidden_sizes"),
-    (["wandb.mode=on"], "wandb.mode=on"),
+    (["wandb.mode=online"], "wandb.mode=online: valid: disabled"),
     (["runs_dir="], "runs_dir="),
     (["foo"], "foo"),
     (["+new=1"], "+new=1"),
