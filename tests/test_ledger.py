@@ -1,6 +1,12 @@
 """The hyper-parameter ledger: complete, and the committed files are what the code says."""
 
+import re
+
+import pytest
+
 from experiments import ledger
+from tests.test_training import LEARNERS, learner
+from tests.toy import run
 
 
 def test_every_setting_has_a_meaning_and_a_source():
@@ -24,3 +30,14 @@ def test_the_papers_appendix_a_is_in_it():
     assert values["hippo", "num_skills"] == "6"
     assert (values["hippo", "period_min"], values["hippo", "period_max"]) == ("5", "15")
     assert values["ppo", "hidden_sizes"] == "[256, 64]"
+
+
+@pytest.mark.parametrize("name", LEARNERS)
+def test_every_column_that_a_learner_writes_is_explained(name, tmp_path):
+    text = (ledger.DOCS / "metrics.md").read_text()
+    train, config = learner(name, iterations=1, batch_size=200)
+    run(train, config, tmp_path)
+    for file in ("progress.csv", "timing.csv"):
+        columns = (tmp_path / file).read_text().splitlines()[0].split(",")
+        unexplained = [c for c in columns if f"`{re.sub('skill_[0-9]+_usage', 'skill_0_usage', c)}`" not in text]
+        assert not unexplained
