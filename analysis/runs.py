@@ -27,29 +27,46 @@ class Results:
     frame: pd.DataFrame  # COLUMNS
     missing: list[dict[str, Any]]  # planned runs without a single row, or cut short, as they stand in the plan
 
+    def missing_lines(self) -> list[str]:
+        """`missing` in words, a line per environment, variant and state."""
+        groups: dict[tuple[str, str, str], list[str]] = {}
+        for run in self.missing:
+            groups.setdefault((run["env"], run["variant"], run["state"]), []).append(str(run["seed"]))
+        return [f"{env} {variant} seed {', '.join(seeds)} ({state})" for (env, variant, state), seeds in groups.items()]
+
 
 def load(
     figure: str, scale: str, runs_dir: Path, data_dir: Path, metrics: Sequence[str] | None = ("return_mean",)
 ) -> Results:
-    """Read every run of a figure; rows of a run folder win over committed rows of the same run.
+    """Read every run of a figure: the rows of its folder, or the committed ones where the plan says `committed`.
 
     Args:
         metrics: columns of progress.csv to read, None for all.
 
     Raises:
         MissingData: no plan, or not one row.
-        ValueError: rows of two kinds of physics for one environment, which must not be drawn together.
+        ValueError: rows of two scales, or of two kinds of physics for one environment, which must not be drawn
+            together; a plan that is no JSON.
     """
     path = runs_dir / "plans" / scale / f"{figure}.json"
     if not path.exists():
         raise MissingData(f"{figure}: no plan at scale {scale} in {runs_dir}; run `make {figure} SCALE={scale}`")
     plan = json.loads(path.read_text())
-    committed = read_committed(data_dir / scale / f"{figure}.csv")
+    if plan["scale"] != scale:
+        raise ValueError(f"{path}: is a plan of scale {plan['scale']}, not of {scale}")
+    physics = pd.DataFrame(plan["runs"]).groupby("env")["physics"].nunique()
+    if (physics > 1).any():
+        raise ValueError(f"{figure}: {physics.idxmax()} mixes two kinds of physics")
+    committed = read_committed(data_dir / scale / f"{figure}.csv", scale)
+    if metrics is not None:
+        committed = committed[committed["metric"].isin(metrics)]
     parts, missing = [], []
     for run in plan["runs"]:
-        rows = read_progress(runs_dir / run["run_id"] / "progress.csv", metrics)
-        if rows.empty:
+        # Not "whatever is there": a run folder may be half trained, and FRESH=1 means that committed rows do not count.
+        if run["state"] == "committed":
             rows = committed.loc[committed["run_id"] == run["run_id"], ["env_steps", "metric", "value"]]
+        else:
+            rows = read_progress(runs_dir / run["run_id"] / "progress.csv", metrics)
         expected = run["iterations"] if run["kind"] == "train" else 1
         if rows.empty or rows.groupby("metric").size().min() < expected:
             missing.append(run)
@@ -59,9 +76,6 @@ def load(
     frame = pd.concat(parts, ignore_index=True)[COLUMNS] if parts else pd.DataFrame(columns=COLUMNS)
     if frame.empty:
         raise MissingData(f"{figure}: none of its {len(plan['runs'])} runs at scale {scale} has a result yet")
-    physics = pd.DataFrame(plan["runs"]).groupby("env")["physics"].nunique()
-    if (physics > 1).any():
-        raise ValueError(f"{figure}: {physics.idxmax()} mixes two kinds of physics")
     return Results(plan, frame, missing)
 
 
@@ -78,11 +92,19 @@ def read_progress(path: Path, metrics: Sequence[str] | None) -> pd.DataFrame:
     return table.melt(id_vars="env_steps", value_vars=columns, var_name="metric")
 
 
-def read_committed(path: Path) -> pd.DataFrame:
-    """Committed rows of a figure, empty where there are none."""
+def read_committed(path: Path, scale: str) -> pd.DataFrame:
+    """Committed rows of a figure, empty where there are none.
+
+    Raises:
+        ValueError: a row is of another scale.
+    """
     if not path.exists():
         return pd.DataFrame(columns=COLUMNS)
-    return pd.read_csv(path, dtype={"run_id": str})
+    table = pd.read_csv(path, dtype={"run_id": str})
+    others = set(table["scale"]) - {scale}
+    if others:
+        raise ValueError(f"{path}: holds rows of scale {', '.join(sorted(others))}, not only of {scale}")
+    return table
 
 
 def scores(

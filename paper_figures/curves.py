@@ -5,11 +5,14 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
+from matplotlib.offsetbox import AnchoredOffsetbox, HPacker, TextArea
 
 from analysis import stats
 from analysis.runs import MissingData, Results, load, scores
@@ -26,42 +29,61 @@ def unique(results: Results, key: str) -> dict[str, str]:
 def draw_panel(axes: Axes, results: Results, env: str, unit: float) -> dict[str, int]:
     """Draw all methods of one environment; returns the number of seeds behind each."""
     variants, seeds_drawn = unique(results, "variant"), {}
-    for variant in variants:
+    for place, variant in enumerate(variants):
         seeds, steps, table = scores(results.frame, env, variant)
         if not seeds:
             continue
         color = style.color_of(variant, list(variants))
         x = np.array(steps) / unit
-        values = table.to_numpy().T  # (S, T)
+        values = table.interpolate(method="index", limit_area="inside").to_numpy().T  # (S, T)
+        above = 3 + (len(variants) - place) / len(variants)  # the figure's first method lies on top
         marker = "." if len(x) < 4 else None  # so that a curve of one point is seen
         for curve in values:
-            axes.plot(x, curve, color=color, alpha=0.3, linewidth=0.7, marker=marker, markersize=2)
+            axes.plot(x, curve, color=color, alpha=0.3, linewidth=0.7, marker=marker, markersize=2, zorder=2)
         complete = ~np.isnan(values).any(0)  # the mean goes as far as every seed does
         interval = stats.bootstrap_mean(values[:, complete])
-        axes.plot(x[complete], interval.point, color=color, marker=marker)
+        axes.plot(x[complete], interval.point, color=color, marker=marker, zorder=above)
         axes.fill_between(x[complete], interval.low, interval.high, color=color, alpha=0.15, linewidth=0)
         seeds_drawn[variant] = len(seeds)
     return seeds_drawn
+
+
+def write_seeds(axes: Axes, seeds: dict[str, int], variants: list[str]) -> None:
+    """Print the number of seeds in a panel: one number, or one per method in its colour where they differ."""
+    style_of: dict[str, Any] = {"fontsize": 6.5, "color": "#555555"}
+    parts: list[Artist] = [TextArea("n =", textprops=style_of)]
+    if len(set(seeds.values())) == 1:
+        parts.append(TextArea(str(min(seeds.values())), textprops=style_of))
+    else:
+        for variant in variants:
+            color = {"color": style.color_of(variant, variants), "fontweight": "bold"}
+            parts.append(TextArea(str(seeds.get(variant, 0)), textprops=style_of | color))
+    box = AnchoredOffsetbox("upper left", child=HPacker(children=parts, pad=0, sep=3), pad=0.1, borderpad=0.3)
+    box.patch.set(facecolor="white", edgecolor="none", alpha=0.75)
+    box.set(in_layout=False, zorder=5)
+    axes.add_artist(box)
 
 
 def caption(results: Results, seeds: dict[str, dict[str, int]]) -> str:
     """What the picture shows and how it was computed, for a reader who sees nothing else."""
     plan = results.plan
     counts = sorted({n for env in seeds.values() for n in env.values()})
-    n = f"{counts[0]}" if len(counts) == 1 else f"{counts[0]} to {counts[-1]} (printed in each panel)"
-    physics = ", ".join(dict.fromkeys(f"{run['env_label']}: {run['physics']} physics" for run in plan["runs"]))
+    n = f"{counts[0]} seeds" if len(counts) == 1 else f"{counts[0]} to {counts[-1]} seeds (printed in each panel)"
+    kinds = dict.fromkeys(run["physics"] for run in plan["runs"])
+    where = {kind: dict.fromkeys(r["env_label"] for r in plan["runs"] if r["physics"] == kind) for kind in kinds}
+    physics = "; ".join(f"{kind} physics ({', '.join(labels)})" for kind, labels in where.items())
     lines = [
         f"{plan['title']}. Scale: {plan['scale']}.",
-        f"Mean undiscounted return of the episodes that open an iteration, against environment steps. n = {n} seeds; "
-        "line: mean over seeds, as far as every seed goes; thin lines: single seeds; no smoothing.",
+        f"Mean undiscounted return of the episodes that open an iteration, against environment steps. n = {n}; "
+        "line: mean over seeds, as far as every seed goes; thin lines: single seeds; no smoothing. "
+        "Where seeds report at different steps, they are interpolated linearly.",
         f"Shaded: {stats.LEVEL:.0%} percentile bootstrap interval of the mean over seeds, {stats.RESAMPLES} resamples, "
         "pointwise. With fewer than about ten seeds it covers less than it says and decides nothing.",
-        f"Physics: {physics}.",
+        f"Simulated with {physics}.",
     ]
     if plan["scale"] in NOT_A_RESULT:
         lines.append("Smoke scale runs every code path in minutes; it says nothing about the methods.")
-    for run in results.missing:
-        lines.append(f"Missing or incomplete: {run['env']} {run['variant']} seed {run['seed']} ({run['state']}).")
+    lines += [f"Missing or incomplete: {what}." for what in results.missing_lines()]
     return "\n".join(lines) + "\n"
 
 
@@ -105,10 +127,12 @@ def draw(results: Results, out: Path, extra: Extra | None = None) -> list[Path]:
             axes.set_axis_off()
             continue
         axes.set_xlim(left=0)
-        n = seeds[env]
-        different = ", ".join(f"{variants[v]}: {count}" for v, count in n.items())
-        text = f"n = {min(n.values())}" if len(set(n.values())) == 1 else f"n: {different}"
-        axes.text(0.98, 0.02, text, transform=axes.transAxes, ha="right", va="bottom", fontsize=6.5, color="#555555")
+        low, high = axes.dataLim.intervaly
+        if low == high:  # lines that all coincide look like one line
+            axes.set_ylim(low - 1, low + 1)
+            text = f"every run: {low:g} throughout"
+            axes.text(0.5, 0.55, text, transform=axes.transAxes, ha="center", fontsize=6.5, color="#555555")
+        write_seeds(axes, seeds[env], list(variants))
     for axes in list(grid.flat)[len(environments) :]:
         axes.set_axis_off()
     for axes in grid[:, 0]:
@@ -141,7 +165,7 @@ def main(figure: str, arguments: Sequence[str] | None = None, extra: Extra | Non
     except (MissingData, ValueError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    for run in results.missing:
-        print(f"missing or incomplete: {run['env']} {run['variant']} seed {run['seed']} ({run['state']})")
+    for what in results.missing_lines():
+        print(f"missing or incomplete: {what}")
     print("wrote " + " ".join(str(path) for path in draw(results, options.out, extra)))
     return 0

@@ -30,7 +30,8 @@ def draw_variance(axes: Axes, results: Results, env: str) -> None:
     axes.bar(list(KINDS), relative.mean(0), color=list(KINDS.values()), width=0.6)
     for row in relative:
         axes.plot(np.arange(len(KINDS)), row, ".", color="black", markersize=3)
-    axes.set_ylim(bottom=0)
+    axes.set_ylim(bottom=0, top=1.15 * relative.max())
+    curves.write_seeds(axes, {"skill": len(relative)}, ["skill"])
     axes.set_xlabel("baseline of the skills")
 
 

@@ -59,7 +59,7 @@ def use() -> None:
 def watermark(figure: Figure, text: str) -> None:
     """Write `text` large and pale across the figure."""
     figure.text(
-        0.5, 0.42, text, fontsize=80, color="#BBBBBB", alpha=0.45, ha="center", va="center", rotation=18, zorder=0
+        0.5, 0.42, text, fontsize=80, color="#BBBBBB", alpha=0.35, ha="center", va="center", rotation=18, zorder=0
     )
 
 

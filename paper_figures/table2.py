@@ -112,8 +112,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     text = f"{results.plan['title']}. {note}\n\n{markdown(table)}"
     stem.with_suffix(".md").write_text(text)
     stem.with_suffix(".tex").write_text(latex(table, results))
-    for run in results.missing:
-        print(f"missing or incomplete: {run['env']} {run['variant']} seed {run['seed']} ({run['state']})")
+    for what in results.missing_lines():
+        print(f"missing or incomplete: {what}")
     print(text)
     print(f"wrote {stem}.csv {stem}.md {stem}.tex")
     return 0

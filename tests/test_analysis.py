@@ -1,6 +1,7 @@
 """Statistics against numbers worked by hand, and run folders to a tidy frame."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -68,10 +69,37 @@ def test_the_stratified_bootstrap_resamples_within_tasks():
     assert (interval.point, interval.low, interval.high) == (1.5, 1.5, 1.5)
 
 
+def test_the_statistics_agree_with_rliable():
+    golden = json.loads((Path(__file__).parent / "golden/analysis/rliable.json").read_text())
+    x, y = np.array(golden["x"]), np.array(golden["y"])
+    assert stats.mean(x).mean() == pytest.approx(golden["mean"], abs=1e-12)
+    assert stats.interquartile_mean(x) == pytest.approx(golden["iqm"], abs=1e-12)
+    per_task = [stats.probability_of_improvement(a, b) for a, b in zip(x.T, y.T, strict=True)]
+    assert np.mean(per_task) == pytest.approx(golden["probability_of_improvement"], abs=1e-12)
+    assert stats.performance_profile(x, np.array(golden["taus"])).tolist() == pytest.approx(golden["profile"])
+    # Two bootstraps of 20 000 resamples with different random numbers; the ends' own noise is about 0.003.
+    iqm = stats.stratified_bootstrap_iqm(x, golden["resamples"])
+    assert [iqm.low, iqm.high] == pytest.approx(golden["iqm_interval"], abs=0.01)
+    assert np.ptp(golden["iqm_interval"]) > 0.2
+    mean = stats.bootstrap_mean(x[:, :1], golden["resamples"])
+    assert [*mean.low, *mean.high] == pytest.approx(golden["mean_interval_of_task_0"], abs=0.01)
+
+
+@pytest.mark.parametrize(("seeds", "expected"), [(3, 0.73), (5, 0.83), (10, 0.90)])
+def test_a_nominal_95_percent_bootstrap_covers_less_with_few_seeds(seeds, expected):
+    # Normal scores with mean 0. Three seeds: the ends are close to the smallest and the largest of the three (each is
+    # the mean of a resample with probability 1/27 = 3.7 %), and 0 lies between them with probability 1 - 2/8 = 0.75.
+    scores = np.random.default_rng(seeds).normal(size=(seeds, 3000))
+    interval = stats.bootstrap_mean(scores, resamples=500)
+    coverage = np.mean((interval.low < 0) & (interval.high > 0))
+    print(f"n = {seeds}: a nominal {stats.LEVEL:.0%} interval covers {coverage:.3f}")
+    assert coverage == pytest.approx(expected, abs=0.03)
+
+
 # ---------------------------------------------------------------------------------------------------------- run folders
 
 
-def planned(tmp_path, lengths, iterations=3, physics=("paper", "paper")):
+def planned(tmp_path, lengths, iterations=3, physics=("paper", "paper"), states=(None, None)):
     """A plan of two seeds, whose progress.csv have the given numbers of rows, None for no folder."""
     entries = []
     for seed, length in enumerate(lengths):
@@ -79,7 +107,8 @@ def planned(tmp_path, lengths, iterations=3, physics=("paper", "paper")):
         entries.append(
             {"run_id": run_id, "env": "block_hopper", "env_label": "Block Hopper", "variant": "ppo"}
             | {"variant_label": "PPO", "seed": seed, "iterations": iterations, "physics": physics[seed]}
-            | {"state": "finished" if length == iterations else "failed", "batch_size": 10, "kind": "train"}
+            | {"state": states[seed] or ("finished" if length == iterations else "failed")}
+            | {"batch_size": 10, "kind": "train"}
         )
         if length is not None:
             (tmp_path / run_id).mkdir()
@@ -117,19 +146,45 @@ def test_a_header_torn_by_a_kill_counts_as_nothing(tmp_path):
     assert [r["seed"] for r in runs.load("fig3", "smoke", tmp_path, tmp_path).missing] == [1]
 
 
-def test_committed_rows_are_used_for_planned_runs_only(tmp_path):
-    planned(tmp_path, [3, None])
+def commit(tmp_path, scale="smoke"):
+    """Committed rows of seeds 0, 1, 2: three steps each, 40 + seed."""
     (tmp_path / "data/smoke").mkdir(parents=True)
     rows = [
-        {"figure": "fig3", "scale": "smoke", "env": "block_hopper", "variant": "ppo", "seed": s, "run_id": f"{s:012x}"}
+        {"figure": "fig3", "scale": scale, "env": "block_hopper", "variant": "ppo", "seed": s, "run_id": f"{s:012x}"}
         | {"env_steps": 10 * (i + 1), "metric": "return_mean", "value": 40.0 + s}
         for s in (0, 1, 2)
         for i in range(3)
     ]
     pd.DataFrame(rows).to_csv(tmp_path / "data/smoke/fig3.csv", index=False)
-    frame = runs.load("fig3", "smoke", tmp_path, tmp_path / "data").frame
+
+
+@pytest.mark.parametrize("length", [None, 1])  # no run folder, or one that was begun here and left
+def test_committed_rows_are_used_for_the_runs_that_the_plan_calls_committed(tmp_path, length):
+    planned(tmp_path, [3, length], states=("finished", "committed"))
+    commit(tmp_path)
+    results = runs.load("fig3", "smoke", tmp_path, tmp_path / "data")
     # Seed 0 has a folder of its own, seed 1 comes from the committed file, seed 2 is not planned.
-    assert frame.groupby("seed")["value"].max().to_dict() == {0: 0.2, 1: 41.0}
+    assert results.frame.groupby("seed")["value"].max().to_dict() == {0: 0.2, 1: 41.0}
+    assert results.missing == []
+
+
+def test_committed_rows_do_not_stand_in_for_a_run_that_failed_here(tmp_path):
+    planned(tmp_path, [3, None], states=("finished", "failed"))  # as with FRESH=1
+    commit(tmp_path)
+    results = runs.load("fig3", "smoke", tmp_path, tmp_path / "data")
+    assert set(results.frame["seed"]) == {0}
+    assert [r["seed"] for r in results.missing] == [1]
+
+
+def test_two_scales_are_never_drawn_together(tmp_path):
+    planned(tmp_path, [3, 3])
+    commit(tmp_path, scale="paper")
+    with pytest.raises(ValueError, match=r"rows of scale paper, not only of smoke"):
+        runs.load("fig3", "smoke", tmp_path, tmp_path / "data")
+    (tmp_path / "plans/paper").mkdir()
+    (tmp_path / "plans/smoke/fig3.json").rename(tmp_path / "plans/paper/fig3.json")
+    with pytest.raises(ValueError, match="a plan of scale smoke, not of paper"):
+        runs.load("fig3", "paper", tmp_path, tmp_path / "data")
 
 
 def test_nothing_to_show_is_an_error_that_says_what_to_do(tmp_path):

@@ -1,11 +1,15 @@
 """Figures: drawn from a plan and run folders, the same bytes every time, honest about what is missing."""
 
+import json
 import subprocess
 import sys
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import pytest
+from matplotlib.text import Text
 
+from analysis.runs import load
 from paper_figures import curves, style
 from tests.test_analysis import planned
 
@@ -43,6 +47,64 @@ def test_a_run_that_never_started_is_named_and_the_rest_is_drawn(tmp_path):
     planned(tmp_path, [3, None])
     assert draw(tmp_path) == 0
     assert "n = 1 seeds" in (tmp_path / "out/smoke/fig3.caption.txt").read_text()
+
+
+def drawn_words(monkeypatch, tmp_path):
+    """Every word of the figure, in drawing order."""
+    words, save = [], style.save
+
+    def spy(figure, *rest):
+        paths = save(figure, *rest)
+        words.extend(text.get_text() for text in figure.findobj(Text))
+        return paths
+
+    monkeypatch.setattr(style, "save", spy)
+    assert draw(tmp_path) == 0
+    return words
+
+
+def two_methods(tmp_path, lengths):
+    """A plan of two methods with two seeds each; `lengths` counts the rows of their four progress.csv."""
+    planned(tmp_path, [3, 3])
+    path = tmp_path / "plans/smoke/fig3.json"
+    plan = json.loads(path.read_text())
+    runs = [
+        run | {"variant": variant, "variant_label": variant, "run_id": f"{variant}{run['seed']}"}
+        for variant in ("hippo_random", "ppo")
+        for run in plan["runs"]
+    ]
+    path.write_text(json.dumps(plan | {"runs": runs}))
+    for run, length in zip(runs, lengths, strict=True):
+        (tmp_path / run["run_id"]).mkdir()
+        rows = "".join(f"{i},{10 * i + 10 + run['seed']},{i}\n" for i in range(length))
+        (tmp_path / run["run_id"] / "progress.csv").write_text("iteration,env_steps,return_mean\n" + rows)
+
+
+def test_methods_with_different_numbers_of_seeds_each_print_their_own(tmp_path, monkeypatch):
+    two_methods(tmp_path, [3, 3, 3, 0])
+    words = drawn_words(monkeypatch, tmp_path)
+    at = words.index("n =")
+    assert words[at + 1 : at + 3] == ["2", "1"]
+    assert "n = 1 to 2 seeds" in (tmp_path / "out/smoke/fig3.caption.txt").read_text()
+
+
+def test_seeds_that_report_at_different_steps_still_have_a_mean(tmp_path):
+    two_methods(tmp_path, [3, 3, 3, 3])  # seed 0 at 10, 20, 30; seed 1 at 11, 21, 31
+    results = load("fig3", "smoke", tmp_path, tmp_path)
+    _, axes = plt.subplots()
+    curves.draw_panel(axes, results, "block_hopper", 1.0)
+    thick = [line for line in axes.lines if line.get_color() == style.COLORS["ppo"]][-1]
+    # Both have a value from 11 to 30: at 11, seed 0 is at (11 - 10) / 10 = 0.1 and seed 1 at 0.
+    assert thick.get_xdata().tolist() == [11, 20, 21, 30]
+    assert thick.get_ydata().tolist() == pytest.approx([0.05, 0.95, 1.05, 1.95])
+    plt.close("all")
+
+
+def test_methods_that_are_all_the_same_are_said_to_be(tmp_path, monkeypatch):
+    planned(tmp_path, [3, 3])
+    for seed in (0, 1):
+        (tmp_path / f"{seed:012x}/progress.csv").write_text("iteration,env_steps,return_mean\n0,10,0\n1,20,0\n2,30,0\n")
+    assert "every run: 0 throughout" in drawn_words(monkeypatch, tmp_path)
 
 
 def test_a_figure_drawn_twice_is_the_same_file(tmp_path):
