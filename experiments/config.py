@@ -22,11 +22,13 @@ from hydra.errors import HydraException
 from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from hippo.core import checkpoint
 from hippo.core.settings import ConfigError
 from hippo.envs import ENVIRONMENTS
 from hippo.envs.registration import Options, check_option
 
 CONF = Path(__file__).parent / "conf"
+COMMITTED = Path(__file__).parent.parent / "paper_figures" / "data"
 # name -> (module, config class); a module holds the config, REVISION and train
 ALGORITHMS = {
     "hippo": ("hippo.hippo", "HippoConfig"),
@@ -38,9 +40,15 @@ BUDGET_FIELDS = ("iterations", "batch_size", "horizon")
 NOT_OVERRIDDEN = {"budget", "seeds", "scale", "env.name", "env.label", "env.seconds_per_step"} | {
     f"algo.{name}" for name in BUDGET_FIELDS
 }
-KINDS = ("train", "measure")
-MEASURE_REVISION = 1  # bumped when what hippo.gradients.measure computes changes
+KINDS = ("train", "pretrain", "evaluate", "measure")
+# Bumped when what hippo.gradients.measure, experiments.evaluate or an algorithm's `skills` makes of a run changes.
+KIND_REVISIONS = {"measure": 1, "evaluate": 1}
+PRETRAINING = {"ant": "snn", "snake": "snn", "hopper": "diayn", "half_cheetah": "diayn"}  # robot -> algorithm
+PRETRAINED = "pretrained"  # value of algo.skills: the skills that the robot's pre-training run makes
+SHARED_WITH_SKILLS = ("num_skills", "skill_hidden_sizes", "skill_integration", "log_std_per_skill")
 WANDB_MODES = ("disabled",)  # the mirror is not built yet; a mode that does nothing would be a lie
+
+installed = functools.cache(version)  # reading a package's metadata takes 3 ms, and a plan asks a thousand times
 
 
 @dataclass
@@ -99,12 +107,47 @@ class Run:
     runs_dir: Path
     wandb_mode: str
     seconds_per_step: float
-    kind: str = "train"  # or "measure": Table 2's quantities of the trained run with the same settings
+    kind: str = "train"  # or pretrain; evaluate and measure are about the trained run with the same settings
+    evaluation: dict[str, Any] | None = None  # of kind evaluate: episodes, perturbations, strengths
 
-    @property
+    @functools.cached_property
     def parent(self) -> "Run | None":
         """The run that must be finished before this one can start."""
-        return None if self.kind == "train" else dataclasses.replace(self, kind="train")
+        if self.is_about_another:
+            return dataclasses.replace(self, kind="train", evaluation=None)
+        return self.pretraining
+
+    @property
+    def is_about_another(self) -> bool:
+        """Whether this run looks at a trained one instead of training."""
+        return self.kind in KIND_REVISIONS
+
+    @property
+    def ancestors(self) -> "list[Run]":
+        """The parent, its parent and so on."""
+        return [] if self.parent is None else [self.parent, *self.parent.ancestors]
+
+    @property
+    def skills(self) -> str:
+        """Where the skills come from: PRETRAINED, a skills file, or "" for none."""
+        return getattr(self.config, "skills", "")
+
+    @property
+    def restored_config(self) -> Any:
+        """The config with which a checkpoint is read: it holds the skills, the file they came from is not needed."""
+        return dataclasses.replace(self.config, skills="") if self.skills else self.config
+
+    @functools.cached_property
+    def pretraining(self) -> "Run | None":
+        """The run that makes this one's skills, one for all seeds as the authors' (Fig. 6); None if they are given."""
+        if self.skills != PRETRAINED:
+            return None
+        robot = ENVIRONMENTS[self.env].robot
+        shared = {name: getattr(self.config, name) for name in SHARED_WITH_SKILLS if hasattr(self.config, name)}
+        overrides = [f"algo.{name}={json.dumps(value)}" for name, value in shared.items()]
+        overrides += [f"env.observation={self.options['observation']}"] * ("observation" in self.options)
+        chosen = [f"env={robot}", f"algo={PRETRAINING[robot]}", f"scale={self.scale}", f"runs_dir={self.runs_dir}"]
+        return compose_run([*chosen, *overrides])
 
     @functools.cached_property
     def identity(self) -> dict[str, Any]:
@@ -114,17 +157,26 @@ class Run:
             for f in dataclasses.fields(self.config)
             if f.name not in BUDGET_FIELDS and getattr(self.config, f.name) != default_of(f)
         }
-        return {
-            "algo": self.algo,
-            "algo_revision": algorithm(self.algo).REVISION,
-            "settings": settings,
-            "env": self.env,
-            "env_revision": ENVIRONMENTS[self.env].revision,
-            "options": self.options,
-            **{name: getattr(self.config, name) for name in BUDGET_FIELDS},
-            "seed": self.seed,
-            "mujoco": version("mujoco"),
-        } | ({} if self.kind == "train" else {"kind": self.kind, "measure_revision": MEASURE_REVISION})
+        if self.skills:
+            settings["skills"] = self.pretraining.run_id if self.pretraining else digest(Path(self.skills))
+        of_the_kind = {}
+        if self.is_about_another:
+            of_the_kind = {"kind": self.kind, f"{self.kind}_revision": KIND_REVISIONS[self.kind]}
+        return (
+            {
+                "algo": self.algo,
+                "algo_revision": algorithm(self.algo).REVISION,
+                "settings": settings,
+                "env": self.env,
+                "env_revision": ENVIRONMENTS[self.env].revision,
+                "options": self.options,
+                **{name: getattr(self.config, name) for name in BUDGET_FIELDS},
+                "seed": self.seed,
+                "mujoco": installed("mujoco"),
+            }
+            | of_the_kind
+            | ({"evaluation": self.evaluation} if self.evaluation else {})
+        )
 
     @functools.cached_property
     def run_id(self) -> str:
@@ -139,13 +191,11 @@ class Run:
     @property
     def env_steps(self) -> int:
         """Environment steps that the whole run takes, without its parent's; a measurement takes two batches."""
-        batches = self.config.iterations if self.kind == "train" else 2
+        if self.evaluation is not None:
+            environments = 1 + len(self.evaluation["perturbations"]) * len(self.evaluation["strengths"])
+            return environments * self.evaluation["episodes"] * self.config.horizon
+        batches = 2 if self.kind == "measure" else self.config.iterations
         return batches * self.config.num_envs * self.config.horizon
-
-    @property
-    def estimated_seconds(self) -> float:
-        """A rough cost on one core."""
-        return self.env_steps * self.seconds_per_step
 
     def to_yaml(self) -> str:
         """The run as text; `Run.from_yaml` gives it back."""
@@ -157,6 +207,21 @@ class Run:
         """Rebuild a run from what `to_yaml` wrote."""
         plain = yaml.safe_load(text)
         return Run(**plain | {"config": config_class(plain["algo"])(**plain["config"]), "runs_dir": runs_dir})
+
+
+def digest(path: Path) -> str:
+    """The start of the SHA-256 of a file."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()[:12]
+
+
+def committed_skills(run: Run) -> Path | None:
+    """The committed skills file, if it is the one that the pre-training `run` would make."""
+    path = COMMITTED / "skills" / f"{run.env}.pt"
+    return (
+        path
+        if run.kind == "pretrain" and path.exists() and checkpoint.load(path)["metadata"]["run_id"] == run.run_id
+        else None
+    )
 
 
 def default_of(f: dataclasses.Field) -> Any:
@@ -292,6 +357,9 @@ def _validated(config: DictConfig, algo: str) -> Run:
             except ValueError as error:
                 raise ConfigError(f"env.{f.name}", env[f.name], str(error).split(": ", 1)[1]) from error
             options[f.name] = env[f.name]
+    skills = plain["algo"].get("skills", "")
+    if skills not in ("", PRETRAINED) and not Path(skills).is_file():
+        raise ConfigError("algo.skills", skills, f"must be {PRETRAINED} or a skills file")
     check_choice("wandb.mode", plain["wandb"]["mode"], WANDB_MODES)
     if not plain["runs_dir"]:
         raise ConfigError("runs_dir", "", "must name a folder")
@@ -307,4 +375,5 @@ def _validated(config: DictConfig, algo: str) -> Run:
         Path(plain["runs_dir"]),
         plain["wandb"]["mode"],
         env["seconds_per_step"],
+        kind="pretrain" if algo in PRETRAINING.values() else "train",
     )

@@ -6,9 +6,9 @@ The same seed gives the same episodes (object positions, wall heights, initial p
 and in every changed environment, so that what differs is the dynamics. Training's random streams are never touched.
 """
 
-import argparse
 import csv
 import io
+import itertools
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,8 +17,9 @@ from typing import Any
 import numpy as np
 import torch
 
+from experiments.command_line import Parser, bad_input
 from experiments.config import Run, algorithm
-from experiments.train import bad_input, write_atomically
+from experiments.status import write_atomically
 from hippo.core import seeding
 from hippo.core.checkpoint import Checkpoint, CheckpointError
 from hippo.core.episodes import opening_episodes
@@ -60,7 +61,7 @@ def evaluate(run: Run, episodes: int, seed: int, greedy: bool = False, **changes
         key, _, value = setting.partition("=")
         raise ConfigError(key, value, valid) from error
     streams = seeding.integer(seed, "evaluation of a policy")
-    steps = algorithm(run.algo).rollout(run.config, envs, streams, Checkpoint(run.folder), greedy)
+    steps = algorithm(run.algo).rollout(run.restored_config, envs, streams, Checkpoint(run.folder), greedy)
     returns, lengths = opening_episodes(steps.reward.numpy(), steps.done.numpy())
     common = {
         "run_id": run.run_id,
@@ -78,6 +79,17 @@ def evaluate(run: Run, episodes: int, seed: int, greedy: bool = False, **changes
     ]
 
 
+def evaluate_all(
+    run: Run, episodes: int, perturbations: Sequence[str], strengths: Sequence[str]
+) -> list[dict[str, Any]]:
+    """Rows of `evaluate` in the original environment, then under every perturbation and strength (Table 1)."""
+    rows = evaluate(run, episodes, run.seed)
+    for strength, perturbation in itertools.product(strengths, perturbations):
+        print(f"{run.run_id}: {perturbation}, {strength}", flush=True)
+        rows += evaluate(run, episodes, run.seed, perturbation=perturbation, strength=strength)
+    return rows
+
+
 def as_csv(rows: Sequence[dict[str, Any]]) -> str:
     """Rows of `evaluate` as csv text."""
     text = io.StringIO()
@@ -89,7 +101,7 @@ def as_csv(rows: Sequence[dict[str, Any]]) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Evaluate from the command line."""
-    parser = argparse.ArgumentParser(prog="experiments.evaluate", description=__doc__.splitlines()[0])
+    parser = Parser(prog="experiments.evaluate", description=__doc__.splitlines()[0])
     parser.add_argument("run", type=Path, help="a run folder")
     parser.add_argument("--perturbation", help="mass, damping, inertia or friction")
     parser.add_argument("--strength", help="original (default) or all")

@@ -5,15 +5,16 @@ import os
 import signal
 import sys
 import time
-from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any
 
+from experiments import costs
 from experiments.config import Run
-from experiments.train import execute, mark_lost
+from experiments.status import mark_lost
+from experiments.train import execute
 
 POLL_SECONDS = 1.0
 
@@ -49,7 +50,7 @@ def cause(exit_code: int) -> str:
 
 
 def run_locally(runs: Sequence[Run], workers: int, on_change: Callable[[dict[str, Run], int], None]) -> dict[str, str]:
-    """Train `runs` in a pool, longest first.
+    """Train `runs` in a pool, parents before what depends on them, the longest first.
 
     A worker that dies fails its own run only, and is replaced. On Ctrl-C every worker abandons its iteration and the
     runs stay resumable.
@@ -60,8 +61,10 @@ def run_locally(runs: Sequence[Run], workers: int, on_change: Callable[[dict[str
     Returns:
         Run id -> final state.
     """
-    context = multiprocessing.get_context("spawn")
-    queue = deque(sorted(runs, key=lambda run: -run.estimated_seconds))
+    context, table = multiprocessing.get_context("spawn"), costs.known()
+    chosen = {run.run_id for run in runs}
+    needed = {a.run_id for run in runs for a in run.ancestors}
+    queue = sorted(runs, key=lambda run: (run.run_id not in needed, -costs.seconds(run, table)))
     states: dict[str, str] = {}
     pool: list[Worker] = []
 
@@ -72,15 +75,32 @@ def run_locally(runs: Sequence[Run], workers: int, on_change: Callable[[dict[str
         theirs.close()
         return Worker(process, ours)
 
-    def give(worker: Worker) -> None:
-        if queue:
-            worker.run = queue.popleft()
-            worker.connection.send((worker.run.to_yaml(), str(worker.run.runs_dir)))
+    def next_run() -> Run | None:
+        """The first run whose parent is not still being trained; those whose parent failed fail with it."""
+        for run in list(queue):
+            before = [a.run_id for a in run.ancestors if a.run_id in chosen]
+            if all(i in states for i in before):
+                queue.remove(run)
+                if all(states[i] in ("finished", "running") for i in before):
+                    return run
+                states[run.run_id] = "failed"
+        return None
+
+    def give_all() -> None:
+        """Hand every idle worker a run, and start workers while there are runs and room for them."""
+        for worker in pool:
+            if worker.run is None and (run := next_run()) is not None:
+                give(worker, run)
+        while len(pool) < workers and (run := next_run()) is not None:
+            pool.append(start())
+            give(pool[-1], run)
+
+    def give(worker: Worker, run: Run) -> None:
+        worker.run = run
+        worker.connection.send((run.to_yaml(), str(run.runs_dir)))
 
     try:
-        for _ in range(min(workers, len(queue))):
-            pool.append(start())
-            give(pool[-1])
+        give_all()
         while busy := [worker for worker in pool if worker.run is not None]:
             ready = wait([worker.connection for worker in busy], timeout=POLL_SECONDS)
             for worker in busy:
@@ -95,11 +115,7 @@ def run_locally(runs: Sequence[Run], workers: int, on_change: Callable[[dict[str
                     states[run.run_id] = "lost"
                     mark_lost(run, f"its process ended: {cause(worker.process.exitcode)}")
                     pool.remove(worker)
-                    if not queue:
-                        continue
-                    worker = start()
-                    pool.append(worker)
-                give(worker)
+            give_all()
             on_change({w.run.run_id: w.run for w in pool if w.run is not None}, len(states))
     finally:
         for worker in pool:

@@ -1,156 +1,30 @@
-"""Plan and train the runs of a figure: what is finished is skipped, what was interrupted goes on, the rest is trained.
+"""Plan and do the runs of a figure: what is finished is skipped, what was interrupted goes on, the rest is trained.
 
-python -m experiments.sweep run fig3 --scale smoke
-python -m experiments.sweep plan fig3 --scale paper
-python -m experiments.sweep status fig3 --scale smoke
+python -m experiments.sweep plan all --scale paper     what would be trained and what it costs on this machine
+python -m experiments.sweep run fig3 --scale smoke     do it; the same command again continues
+python -m experiments.sweep status fig3 --watch        how every run is doing
+python -m experiments.sweep retry fig3                 once more what the machine, not the code, made fail
 """
 
 import argparse
-import csv
-import dataclasses
-import json
 import os
 import signal
 import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-import yaml
-
-from experiments.config import CONF, Run, check_choice, choices, compose_run
+from experiments import costs
+from experiments.command_line import EXIT_FAILED, EXIT_REQUEUE, Parser, bad_input, clock
+from experiments.config import Run, check_choice, choices
 from experiments.launchers import run_locally
-from experiments.train import EXIT_FAILED, EXIT_REQUEUE, bad_input, clock, read_status, write_atomically
+from experiments.plan import Plan, make_plan, overview, summary
+from experiments.status import DONE, read_status
 from hippo.core.settings import ConfigError
 
-COMMITTED = Path(__file__).parent.parent / "paper_figures" / "data"
 LAUNCHERS = ("local",)
 REPORT_SECONDS = 10.0  # between two progress lines
-DONE = ("finished", "committed")
-FIXED = ("env", "algo", "scale", "seed", "runs_dir")  # the plan's own business, not that of --set
-
-
-@dataclass
-class Entry:
-    """One run of a figure: where it stands in the figure and how it is doing."""
-
-    run: Run
-    env_label: str
-    variant: str
-    variant_label: str
-    state: str
-
-
-@dataclass
-class Plan:
-    """All runs of one figure at one scale."""
-
-    figure: str
-    scale: str
-    title: str
-    claims: list[str]
-    notes: list[str]
-    entries: list[Entry]
-
-    def todo(self) -> list[Run]:
-        """Runs that still have to be trained, each once; a diverged one would only diverge again."""
-        return list({e.run.run_id: e.run for e in self.entries if e.state not in (*DONE, "diverged")}.values())
-
-    def to_pay(self) -> list[Run]:
-        """`todo` and the parents that its runs will have to train first, each once."""
-        parents = [run.parent for run in self.todo() if run.parent is not None]
-        unfinished = [run for run in parents if read_status(run.folder)["state"] != "finished"]
-        return list({run.run_id: run for run in [*self.todo(), *unfinished]}.values())
-
-    def write(self, runs_dir: Path) -> Path:
-        """Write the plan for analysis and drawing, which read nothing else but run folders and committed rows."""
-        path = runs_dir / "plans" / self.scale / f"{self.figure}.json"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        content = {
-            "figure": self.figure,
-            "scale": self.scale,
-            "title": self.title,
-            "runs": [
-                {
-                    "run_id": e.run.run_id,
-                    "env": e.run.env,
-                    "env_label": e.env_label,
-                    "variant": e.variant,
-                    "variant_label": e.variant_label,
-                    "seed": e.run.seed,
-                    "iterations": e.run.config.iterations,
-                    "batch_size": e.run.config.batch_size,
-                    "physics": e.run.options.get("physics", "paper"),
-                    "kind": e.run.kind,
-                    "state": e.state,
-                }
-                for e in self.entries
-            ],
-            "claims": self.claims,
-            "notes": self.notes,
-        }
-        write_atomically(path, json.dumps(content, indent=1))
-        return path
-
-
-def load_figure(figure: str) -> dict[str, Any]:
-    """conf/figure/<figure>.yaml."""
-    check_choice("figure", figure, choices("figure"))
-    return yaml.safe_load((CONF / "figure" / f"{figure}.yaml").read_text())
-
-
-def committed_runs(figure: str, scale: str) -> set[str]:
-    """Ids of the runs whose rows are committed for this figure and scale."""
-    path = COMMITTED / scale / f"{figure}.csv"
-    if not path.exists():
-        return set()
-    with path.open() as file:
-        return {row["run_id"] for row in csv.DictReader(file)}
-
-
-def make_plan(figure: str, scale: str, settings: Sequence[str], fresh: bool, runs_dir: Path) -> Plan:
-    """Resolve a figure into runs and look up how each is doing."""
-    description = load_figure(figure)
-    check_choice("scale", scale, choices("scale"))
-    for setting in settings:
-        if (key := setting.partition("=")[0]) in FIXED:
-            raise ConfigError(f"set {key}", setting.partition("=")[2], f"{figure} and the sweep's options decide {key}")
-    seeds = yaml.safe_load((CONF / "scale" / f"{scale}.yaml").read_text())["seeds"]
-    committed = set() if fresh else committed_runs(figure, scale)
-    entries = []
-    for env in description["environments"]:
-        label = yaml.safe_load((CONF / "env" / f"{env}.yaml").read_text())["label"]
-        for variant, what in description["variants"].items():
-            chosen = [f"env={env}", f"algo={what['algo']}", f"scale={scale}", f"runs_dir={runs_dir}"]
-            for seed in range(seeds):
-                run = compose_run([*chosen, *what.get("settings", []), *settings, f"seed={seed}"])
-                run = dataclasses.replace(run, kind=what.get("kind", description.get("kind", "train")))
-                state = read_status(run.folder)["state"]
-                if state != "finished" and run.run_id in committed:
-                    state = "committed"
-                entries.append(Entry(run, label, variant, what["label"], state))
-    return Plan(
-        figure, scale, description["title"], description.get("claims", []), description.get("notes", []), entries
-    )
-
-
-def summary(plan: Plan) -> str:
-    """One paragraph: how many runs, how they are doing, what is left to pay."""
-    runs = {e.run.run_id: e for e in plan.entries}
-    states = sorted({e.state for e in runs.values()})
-    counts = ", ".join(f"{sum(e.state == state for e in runs.values())} {state}" for state in states)
-    todo, cost = plan.to_pay(), sum(run.estimated_seconds for run in plan.to_pay())
-    return (
-        f"{plan.figure} at scale {plan.scale}: {len(runs)} runs ({counts}); to train: {len(todo)} runs, "
-        f"{sum(run.env_steps for run in todo):,} environment steps, about {duration(cost)} on one core"
-    )
-
-
-def duration(seconds: float) -> str:
-    """Seconds in the unit that reads best."""
-    return f"{seconds / 60:.1f} minutes" if seconds < 3600 else f"{seconds / 3600:,.1f} hours"
+MAX_ATTEMPTS = 3  # of a run that the machine made fail, before `retry` leaves it alone
 
 
 def train_all(todo: Sequence[Run], workers: int, report: Callable[[int, int], None]) -> dict[str, str]:
@@ -175,20 +49,20 @@ def train_all(todo: Sequence[Run], workers: int, report: Callable[[int, int], No
     return states
 
 
-def run_figure(plan: Plan, workers: int, runs_dir: Path) -> int:
-    """Train what is missing; returns the exit code."""
-    todo, started, last_report = plan.todo(), time.monotonic(), time.monotonic()
-    by_id = {run.run_id: run for run in plan.to_pay()}
-    total = sum(run.estimated_seconds for run in by_id.values())
-    begun = {i: read_status(run.folder).get("iteration", -1) + 1 for i, run in by_id.items()}
+def run_figure(plan: Plan, todo: Sequence[Run], workers: int, runs_dir: Path) -> int:
+    """Do `todo`, write the plan with what became of it, and name what failed; returns the exit code."""
+    started, last_report = time.monotonic(), time.monotonic()
+    table = costs.known()
+    estimate = {run.run_id: costs.seconds(run, table) for run in todo}
+    begun = {run.run_id: read_status(run.folder).get("iteration", -1) + 1 for run in todo}
 
     def progress() -> float:
         """Estimated seconds of work done since the start."""
         return sum(
-            (read_status(run.folder).get("iteration", -1) + 1 - begun[i])
+            (read_status(run.folder).get("iteration", -1) + 1 - begun[run.run_id])
             / run.config.iterations
-            * run.estimated_seconds
-            for i, run in by_id.items()
+            * estimate[run.run_id]
+            for run in todo
         )
 
     terminal = sys.stdout.isatty()
@@ -199,7 +73,7 @@ def run_figure(plan: Plan, workers: int, runs_dir: Path) -> int:
             return
         last_report = time.monotonic()
         elapsed, done = last_report - started, progress()
-        eta = clock(elapsed * (total - done) / done) if done > 0 else "unknown"
+        eta = clock(elapsed * (sum(estimate.values()) - done) / done) if done > 0 else "unknown"
         line = f"[{ended}/{len(todo)}] {running} running, elapsed {clock(elapsed)}, ETA {eta}"
         print(f"\r{line}\x1b[K" if terminal else line, end="" if terminal else "\n", flush=True)
 
@@ -215,43 +89,72 @@ def run_figure(plan: Plan, workers: int, runs_dir: Path) -> int:
     if todo:
         start_of_line = "\r" if terminal else ""
         print(f"{start_of_line}[{len(todo)}/{len(todo)}] done in {clock(time.monotonic() - started)}")
-    bad = {e.run.run_id: e for e in plan.entries if e.state not in DONE}
-    for e in bad.values():
-        message = read_status(e.run.folder).get("message", "")
-        where = f"{e.run.env} {e.variant} seed {e.run.seed}"
-        print(f"{e.state}: {where}: {message} (log: {e.run.folder / 'train.log'})", file=sys.stderr)
+    return name_failures(plan, todo, states)
+
+
+def name_failures(plan: Plan, todo: Sequence[Run], states: dict[str, str]) -> int:
+    """A line on stderr for every run that is not done; returns the exit code."""
+    names = {e.run.run_id: f"{e.run.env} {e.variant} seed {e.run.seed}" for e in plan.entries}
+    bad = {e.run.run_id: (e.run, e.state) for e in plan.entries if e.state not in DONE}
+    bad |= {run.run_id: (run, states[run.run_id]) for run in todo if states.get(run.run_id, "finished") not in DONE}
+    for run_id, (run, state) in bad.items():
+        name = names.get(run_id, f"{run.env} {run.algo} seed {run.seed}")
+        unfinished = [a.run_id for a in run.ancestors if a.run_id in bad]
+        message = f"needs {unfinished[0]}" if unfinished else read_status(run.folder).get("message", "")
+        print(f"{state}: {name}: {message} (log: {run.folder / 'train.log'})", file=sys.stderr)
     return EXIT_FAILED if bad else 0
 
 
 def status_table(plan: Plan) -> str:
-    """A line per run: state, progress, speed, message."""
-    lines = [
-        f"{'run':12}  {'environment':18} {'variant':14} {'seed':>4}  {'state':10} {'iteration':>11} {'steps/s':>9}"
-    ]
-    for e in plan.entries:
-        s = read_status(e.run.folder)
-        done = f"{s.get('iteration', -1) + 1}/{e.run.config.iterations}"
+    """A line per run: state, progress, ETA, speed; of those that ended badly also cause, log and what to type."""
+    columns = f"{'environment':18} {'variant':22} {'seed':>4}  {'state':10} {'iteration':>11} {'ETA':>8} {'steps/s':>9}"
+    lines = [f"{'run':12}  {columns}"]
+    variants = {e.run.run_id: (e.variant, e.state) for e in plan.entries}
+    for run in plan.runs():
+        variant, state = variants.get(run.run_id, (run.kind, ""))
+        s = read_status(run.folder)
+        state = state if state == "committed" else s["state"]
+        done = f"{s.get('iteration', -1) + 1}/{run.config.iterations}"
         speed = f"{s['steps_per_second']:,.0f}" if s.get("steps_per_second") else ""
+        eta = clock(s["eta"]) if state == "running" and "eta" in s else ""
+        cells = f"{run.env:18} {variant:22} {run.seed:4}  {state:10} {done:>11} {eta:>8} {speed:>9}"
+        lines.append(f"{run.run_id:12}  {cells}".rstrip())
+        if state in ("failed", "diverged", "lost", "preempted"):
+            lines.append(f"{'':14}{s['message'] or state} (log: {run.folder / 'train.log'})")
+    to_retry = may_retry(plan)
+    if to_retry:
         lines.append(
-            f"{e.run.run_id:12}  {e.run.env:18} {e.variant:14} {e.run.seed:4}  {e.state:10} {done:>11} {speed:>9}"
-            f"  {s.get('message', '')}".rstrip()
+            f"{len(to_retry)} to try again: python -m experiments.sweep retry {plan.figure} --scale {plan.scale}"
         )
     return "\n".join(lines)
 
 
-class _Parser(argparse.ArgumentParser):
-    """Reports bad arguments in one line, as every other bad input."""
+def may_retry(plan: Plan) -> list[Run]:
+    """Runs that the machine made fail: killed, preempted, disk full; not those that diverged or met a bug."""
+    chosen = []
+    for run in plan.runs():
+        status = read_status(run.folder)
+        machine = status["state"] in ("lost", "preempted") or status.get("cause") == "infrastructure"
+        if machine and status["state"] not in (*DONE, "running") and status.get("attempts", 0) < MAX_ATTEMPTS:
+            chosen.append(run)
+    return chosen
 
-    def error(self, message: str) -> Any:
-        print(f"error: {message}", file=sys.stderr)
-        sys.exit(2)
+
+def watch(make: Callable[[], Plan]) -> None:
+    """Print the status table every two seconds until nothing runs or waits any more."""
+    while True:
+        table = status_table(plan := make())
+        print(f"\x1b[2J\x1b[H{table}" if sys.stdout.isatty() else table, flush=True)
+        if not any(read_status(run.folder)["state"] in ("running", "pending") for run in plan.runs()):
+            return
+        time.sleep(2.0)
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     """The command line."""
-    parser = _Parser(prog="experiments.sweep", description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("action", choices=("plan", "run", "status"))
-    parser.add_argument("figure", help="a figure or table of conf/figure")
+    parser = Parser(prog="experiments.sweep", description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("action", choices=("plan", "run", "status", "retry"))
+    parser.add_argument("figure", help="a figure or table of conf/figure; `plan` also takes all")
     parser.add_argument("--scale", default="smoke", help="smoke, laptop or paper")
     parser.add_argument("--launcher", default="local", help=", ".join(LAUNCHERS))
     parser.add_argument("--workers", type=int, default=len(os.sched_getaffinity(0)), help="processes, one thread each")
@@ -259,32 +162,45 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--fresh", action="store_true", help="ignore committed results")
     parser.add_argument("--max-core-hours", type=float, default=100.0, help="refuse to start more than this")
     parser.add_argument("--yes", action="store_true", help="start it all the same")
+    parser.add_argument("--watch", action="store_true", help="status: again and again until nothing runs")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="override in every run")
     return parser.parse_args(arguments)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Plan, run or report; the exit code is 0 when everything asked for is there."""
+    """Plan, run, report or retry; the exit code is 0 when everything asked for is there."""
     options = parse(arguments)
+
+    def plan_of(figure: str) -> Plan:
+        return make_plan(figure, options.scale, options.set, options.fresh, options.runs_dir)
+
     try:
         check_choice("launcher", options.launcher, LAUNCHERS)
         if options.workers < 1:
             raise ConfigError("workers", options.workers, "must be at least 1")
-        plan = make_plan(options.figure, options.scale, options.set, options.fresh, options.runs_dir)
-        cost = sum(run.estimated_seconds for run in plan.to_pay()) / 3600
-        if options.action == "run" and cost > options.max_core_hours and not options.yes:
+        if options.action == "plan":
+            figures = choices("figure") if options.figure == "all" else [options.figure]
+            print(overview([plan_of(figure) for figure in figures], options.workers))
+            return 0
+        plan = plan_of(options.figure)
+        todo = may_retry(plan) if options.action == "retry" else plan.todo()
+        if options.action == "run" and options.scale != "smoke":
+            costs.calibrate(todo)
+        cost = sum(costs.seconds(run) for run in todo) / 3600
+        if options.action != "status" and cost > options.max_core_hours and not options.yes:
             valid = f"below the estimate of {cost:,.0f}; raise it or agree with --yes (make ... YES=1)"
             raise ConfigError("max-core-hours", options.max_core_hours, valid)
     except ConfigError as error:
         return bad_input(error)
+    if options.action == "status" and options.watch:
+        watch(lambda: plan_of(options.figure))
+        return 0
     if options.action == "status":
         print(status_table(plan))
         return 0
     print(summary(plan), flush=True)
-    if options.action == "plan":
-        return 0
     plan.write(options.runs_dir)
-    return run_figure(plan, options.workers, options.runs_dir)
+    return run_figure(plan, todo, options.workers, options.runs_dir)
 
 
 if __name__ == "__main__":

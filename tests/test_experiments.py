@@ -5,6 +5,7 @@ import os
 import re
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -12,8 +13,10 @@ from pathlib import Path
 
 import pytest
 
-from experiments import launchers, sweep, train
-from experiments.config import Run, compose_run
+from experiments import costs, launchers, sweep, train
+from experiments.config import COMMITTED, Run, compose_run
+from experiments.plan import committed_runs, make_plan
+from experiments.status import Status, read_status
 from hippo.core.checkpoint import load
 
 TINY = ["env=block_hopper", "scale=smoke", "iterations=3", "batch_size=400"]
@@ -126,7 +129,8 @@ def test_a_wrong_configuration_is_refused_in_one_line_and_nothing_is_written(ove
         (["run"], "figure"),
     ],
 )
-def test_a_wrong_sweep_is_refused_in_one_line_and_nothing_is_written(arguments, message, tmp_path, capsys):
+def test_a_wrong_sweep_is_refused_in_one_line_and_nothing_is_written(arguments, message, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(costs, "measure", lambda run: costs.Cost(1e-4, 100_000, 600, "2026-01-01"))
     try:
         code = sweep.main([*arguments, "--runs-dir", str(tmp_path / "runs")])
     except SystemExit as exit:
@@ -201,9 +205,9 @@ def test_a_second_launch_of_a_running_run_leaves_it_alone(tmp_path, capsys):
     run = compose_run([*TINY, f"runs_dir={tmp_path}"])
     run.folder.mkdir()
     with train.FileLock(run.folder / ".lock"):
-        train.Status(run).update()
+        Status(run).update()
         assert train.execute(run) == "running"
-    assert f"already running (host {train.socket.gethostname()}, pid {os.getpid()})" in capsys.readouterr().out
+    assert f"already running (host {socket.gethostname()}, pid {os.getpid()})" in capsys.readouterr().out
     assert not (run.folder / "progress.csv").exists()
 
 
@@ -230,10 +234,10 @@ def test_a_run_that_diverges_or_fails_says_so(tmp_path, monkeypatch, capsys):
 
 def test_a_run_whose_heartbeat_stopped_is_lost(tmp_path):
     (tmp_path / "status.json").write_text(json.dumps({"state": "running", "heartbeat": time.time() - 3600}))
-    assert train.read_status(tmp_path)["state"] == "lost"
+    assert read_status(tmp_path)["state"] == "lost"
     (tmp_path / "status.json").write_text(json.dumps({"state": "running", "heartbeat": time.time()}))
-    assert train.read_status(tmp_path)["state"] == "running"
-    assert train.read_status(tmp_path / "nowhere")["state"] == "missing"
+    assert read_status(tmp_path)["state"] == "running"
+    assert read_status(tmp_path / "nowhere")["state"] == "missing"
 
 
 # --------------------------------------------------------------------------------------------------------------- sweeps
@@ -243,8 +247,7 @@ def test_a_run_whose_heartbeat_stopped_is_lost(tmp_path):
 def tiny_figure(monkeypatch):
     """A figure of four short runs."""
     monkeypatch.setattr(
-        sweep,
-        "load_figure",
+        "experiments.plan.load_figure",
         lambda name: {
             "title": "tiny",
             "environments": ["block_hopper"],
@@ -284,8 +287,8 @@ def test_a_measurement_trains_its_parent_first_and_shares_it(tmp_path, capsys):
     assert len(parents) == len(ids) == 8
     assert not parents & ids
     # Paid for: 8 runs of one batch (400 steps, the Snake's too), and 8 measurements of two.
-    again = sweep.make_plan("table2", "smoke", settings[1::2], False, tmp_path / "elsewhere")
-    assert (len(again.todo()), sum(run.env_steps for run in again.to_pay())) == (8, 8 * 400 + 8 * 800)
+    again = make_plan("table2", "smoke", settings[1::2], False, tmp_path / "elsewhere")
+    assert (len(again.todo()), sum(run.env_steps for run in again.todo())) == (16, 8 * 400 + 8 * 800)
     (row,) = (tmp_path / min(ids) / "progress.csv").read_text().splitlines()[1:]
     assert row.startswith("1,")  # the batch after one iteration of training
     run = compose_run(["env=ant_gather", "scale=smoke", *settings[1::2], f"runs_dir={tmp_path}"])
@@ -297,14 +300,14 @@ def test_a_measurement_trains_its_parent_first_and_shares_it(tmp_path, capsys):
 
 
 def test_committed_rows_stand_in_for_training_unless_fresh_is_asked_for(tiny_figure, tmp_path, monkeypatch):
-    plan = sweep.make_plan("tiny", "smoke", tiny_figure[3::2], False, tmp_path)
+    plan = make_plan("tiny", "smoke", tiny_figure[3::2], False, tmp_path)
     assert len(plan.todo()) == 4
     committed = tmp_path / "data"
     (committed / "smoke").mkdir(parents=True)
     (committed / "smoke/tiny.csv").write_text(f"run_id,value\n{plan.entries[0].run.run_id},1\n")
-    monkeypatch.setattr(sweep, "COMMITTED", committed)
-    assert len(sweep.make_plan("tiny", "smoke", tiny_figure[3::2], False, tmp_path).todo()) == 3
-    assert len(sweep.make_plan("tiny", "smoke", tiny_figure[3::2], True, tmp_path).todo()) == 4
+    monkeypatch.setattr("experiments.plan.COMMITTED", committed)
+    assert len(make_plan("tiny", "smoke", tiny_figure[3::2], False, tmp_path).todo()) == 3
+    assert len(make_plan("tiny", "smoke", tiny_figure[3::2], True, tmp_path).todo()) == 4
 
 
 def test_a_worker_that_dies_fails_its_own_run_only_and_the_next_sweep_continues_it(tmp_path):
@@ -316,7 +319,7 @@ def test_a_worker_that_dies_fails_its_own_run_only_and_the_next_sweep_continues_
 
     def kill_once(active, ended):
         for run in active.values():
-            status = train.read_status(run.folder)
+            status = read_status(run.folder)
             if not killed and run.seed == 0 and status["iteration"] >= 1:
                 killed.append(run.run_id)
                 os.kill(status["pid"], signal.SIGKILL)
@@ -367,6 +370,6 @@ def test_ctrl_c_leaves_every_run_resumable_and_no_orphan(tmp_path):
 
 
 def test_every_committed_row_belongs_to_a_run_that_its_plan_still_yields():
-    for path in sweep.COMMITTED.glob("*/fig*.csv"):
-        plan = sweep.make_plan(path.stem, path.parent.name, [], True, Path("runs"))
-        assert sweep.committed_runs(path.stem, path.parent.name) <= {e.run.run_id for e in plan.entries}
+    for path in COMMITTED.glob("*/fig*.csv"):
+        plan = make_plan(path.stem, path.parent.name, [], True, Path("runs"))
+        assert committed_runs(path.stem, path.parent.name) <= {e.run.run_id for e in plan.entries}

@@ -12,7 +12,10 @@ from pathlib import Path
 import pytest
 
 from experiments import launchers, sweep, train
+from experiments.command_line import EXIT_FAILED, EXIT_REQUEUE
 from experiments.config import compose_run
+from experiments.plan import FIXED, make_plan
+from experiments.status import Status, mark_lost, read_status
 
 ROOT = Path(__file__).parent.parent
 TINY = ["env=block_hopper", "scale=smoke", "iterations=2", "batch_size=400"]
@@ -24,8 +27,8 @@ FIGURE = {
 SCRIPT = f"""
 if __name__ == "__main__":  # workers import this file again
     import sys
-    from experiments import sweep
-    sweep.load_figure = lambda name: {FIGURE!r}
+    from experiments import plan, sweep
+    plan.load_figure = lambda name: {FIGURE!r}
     sys.exit(sweep.main(sys.argv[1:]))
 """
 
@@ -53,7 +56,7 @@ def tiny_run(tmp_path):
 
 @pytest.fixture
 def tiny_figure(monkeypatch):
-    monkeypatch.setattr(sweep, "load_figure", lambda name: FIGURE)
+    monkeypatch.setattr("experiments.plan.load_figure", lambda name: FIGURE)
 
 
 def test_two_sweeps_started_together_train_every_run_once_and_both_succeed(tmp_path):
@@ -76,7 +79,7 @@ def test_a_terminated_sweep_leaves_every_run_resumable_and_no_orphan(tmp_path):
         time.sleep(0.05)
     process.send_signal(signal.SIGTERM)
     _, error = process.communicate(timeout=40)
-    assert process.returncode == train.EXIT_REQUEUE
+    assert process.returncode == EXIT_REQUEUE
     assert "the same command continues" in error
     states = [json.loads(path.read_text()) for path in (tmp_path / "runs").glob("*/status.json")]
     assert {status["state"] for status in states} == {"preempted"}
@@ -86,16 +89,16 @@ def test_a_terminated_sweep_leaves_every_run_resumable_and_no_orphan(tmp_path):
 def test_a_diverged_run_is_reported_and_not_trained_again(tiny_figure, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(sweep, "run_locally", lambda runs, *_: {run.run_id: "finished" for run in runs})
     arguments = ["tiny", "--runs-dir", str(tmp_path)]
-    run = sweep.make_plan("tiny", "smoke", [], False, tmp_path).entries[0].run
+    run = make_plan("tiny", "smoke", [], False, tmp_path).entries[0].run
     run.folder.mkdir()
     (run.folder / "status.json").write_text(json.dumps({"state": "diverged", "message": "iteration 1: a NaN"}))
-    assert sweep.main(["run", *arguments]) == train.EXIT_FAILED
+    assert sweep.main(["run", *arguments]) == EXIT_FAILED
     captured = capsys.readouterr()
     assert "to train: 3 runs" in captured.out
     assert captured.err.startswith("diverged: block_hopper hippo seed 0: iteration 1: a NaN")
 
 
-@pytest.mark.parametrize("key", sweep.FIXED)
+@pytest.mark.parametrize("key", FIXED)
 def test_what_the_plan_decides_cannot_be_set(key, tiny_figure, tmp_path, capsys):
     assert sweep.main(["run", "tiny", "--runs-dir", str(tmp_path / "runs"), "--set", f"{key}=1"]) == 2
     assert f"set {key}=1" in capsys.readouterr().err
@@ -113,44 +116,44 @@ def test_overrides_that_name_nothing_are_refused(override, message, capsys):
 
 def test_a_lost_process_leaves_its_cause_unless_the_run_was_taken_over_or_is_done(tiny_run):
     def state():
-        return train.read_status(tiny_run.folder)["state"]
+        return read_status(tiny_run.folder)["state"]
 
     tiny_run.folder.mkdir(exist_ok=True)
-    train.Status(tiny_run).update()
+    Status(tiny_run).update()
     with train.FileLock(tiny_run.folder / ".lock"):  # another process trains it
-        train.mark_lost(tiny_run, "killed")
+        mark_lost(tiny_run, "killed")
     assert state() == "running"
-    train.mark_lost(tiny_run, f"its process ended: {launchers.cause(-signal.SIGKILL)}")
+    mark_lost(tiny_run, f"its process ended: {launchers.cause(-signal.SIGKILL)}")
     assert state() == "lost"
-    assert train.read_status(tiny_run.folder)["message"] == "its process ended: SIGKILL"
-    train.Status(tiny_run).update(state="finished")
-    train.mark_lost(tiny_run, "killed")
+    assert read_status(tiny_run.folder)["message"] == "its process ended: SIGKILL"
+    Status(tiny_run).update(state="finished")
+    mark_lost(tiny_run, "killed")
     assert state() == "finished"
 
 
 def test_a_process_that_ends_before_its_run_began_leaves_its_cause(tiny_run):
-    train.mark_lost(tiny_run, launchers.cause(1))
-    status = train.read_status(tiny_run.folder)
+    mark_lost(tiny_run, launchers.cause(1))
+    status = read_status(tiny_run.folder)
     assert (status["state"], status["message"]) == ("lost", "exit code 1")
 
 
 def test_a_damaged_status_is_lost_and_the_run_trains_all_the_same(tiny_run):
     tiny_run.folder.mkdir(exist_ok=True)
     (tiny_run.folder / "status.json").write_text("")
-    assert train.read_status(tiny_run.folder)["state"] == "lost"
+    assert read_status(tiny_run.folder)["state"] == "lost"
     assert train.execute(tiny_run) == "finished"
 
 
 def test_damaged_checkpoints_end_the_run_with_one_line_and_no_traceback(tiny_run, capsys):
     assert train.execute(tiny_run) == "finished"
-    train.Status(tiny_run).update(state="running")
+    Status(tiny_run).update(state="running")
     for name in ("checkpoint.pt", "checkpoint.prev.pt"):
         (tiny_run.folder / name).write_bytes(b"no checkpoint")
     assert train.execute(tiny_run) == "failed"
     error = capsys.readouterr().err
     assert "no intact checkpoint" in error
     assert "Traceback" not in error
-    assert "no intact checkpoint" in train.read_status(tiny_run.folder)["message"]
+    assert "no intact checkpoint" in read_status(tiny_run.folder)["message"]
 
 
 def test_resuming_under_another_commit_is_announced_and_both_commits_are_kept(tiny_run, capsys):
@@ -159,7 +162,7 @@ def test_resuming_under_another_commit_is_announced_and_both_commits_are_kept(ti
     manifest = json.loads(path.read_text())
     assert manifest["earlier_commits"] == []
     path.write_text(json.dumps(manifest | {"git_commit": "0" * 40}))
-    train.Status(tiny_run).update(state="preempted")
+    Status(tiny_run).update(state="preempted")
     assert train.execute(tiny_run) == "finished"
     assert "last under 0000000000" in capsys.readouterr().out
     resumed = json.loads(path.read_text())

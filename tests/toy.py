@@ -17,6 +17,7 @@ class TargetEnv(gym.vector.VectorEnv):
     """
 
     metadata = {"autoreset_mode": gym.vector.AutoresetMode.SAME_STEP}  # noqa: RUF012
+    robot_name, observation_variant = "toy", "paper"
 
     def __init__(self, num_envs: int, seed: int, horizon: int = 20, size: int = 2, death_rate: float = 0.0) -> None:
         self.num_envs, self.horizon, self.death_rate = num_envs, horizon, death_rate

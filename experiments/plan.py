@@ -1,0 +1,213 @@
+"""The plan of a figure: its runs, how each is doing, what is shared with other figures and what is left to pay."""
+
+import csv
+import dataclasses
+import json
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from experiments import costs
+from experiments.command_line import duration
+from experiments.config import COMMITTED, CONF, Run, check_choice, choices, compose_run
+from experiments.status import DONE, is_there, read_status, write_atomically
+from hippo.core.settings import ConfigError
+
+FIXED = ("env", "algo", "scale", "seed", "runs_dir")  # the plan's own business, not that of --set
+
+
+@dataclass
+class Entry:
+    """One run of a figure: where it stands in the figure and how it is doing."""
+
+    run: Run
+    env_label: str
+    variant: str
+    variant_label: str
+    state: str
+
+
+@dataclass
+class Plan:
+    """All runs of one figure at one scale."""
+
+    figure: str
+    scale: str
+    description: dict[str, Any]  # conf/figure/<figure>.yaml
+    fresh: bool  # committed results do not count
+    entries: list[Entry]
+
+    def runs(self) -> list[Run]:
+        """Its runs and what they depend on, each once, parents first."""
+        return unique([run for e in self.entries for run in [*reversed(e.run.ancestors), e.run]])
+
+    def todo(self) -> list[Run]:
+        """Runs still to be done, each once, parents first; a diverged one would only diverge again."""
+        waiting = [e.run for e in self.entries if e.state not in (*DONE, "diverged")]
+        return unique([r for run in waiting for r in [*reversed(self._missing_ancestors(run)), run]])
+
+    def _missing_ancestors(self, run: Run) -> list[Run]:
+        """Nearest first; what lies behind a finished one is not needed."""
+        parent = run.parent
+        if parent is None or is_there(parent, self.fresh):
+            return []
+        return [parent, *self._missing_ancestors(parent)]
+
+    def write(self, runs_dir: Path) -> Path:
+        """Write the plan for analysis and drawing, which read nothing else but run folders and committed rows."""
+        path = runs_dir / "plans" / self.scale / f"{self.figure}.json"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        left_out = self.description.get("not_trained", {}).get(self.scale, [])
+        content = {
+            "figure": self.figure,
+            "scale": self.scale,
+            "title": self.description["title"],
+            "not_trained": [{"env": env, "env_label": env_label(env)} for env in left_out],
+            "runs": [
+                {
+                    "run_id": e.run.run_id,
+                    "env": e.run.env,
+                    "env_label": e.env_label,
+                    "variant": e.variant,
+                    "variant_label": e.variant_label,
+                    "seed": e.run.seed,
+                    "iterations": e.run.config.iterations,
+                    "batch_size": e.run.config.batch_size,
+                    "physics": e.run.options.get("physics", "paper"),
+                    "kind": e.run.kind,
+                    "ancestors": [run.run_id for run in e.run.ancestors],
+                    "state": e.state,
+                }
+                for e in self.entries
+            ],
+            "claims": self.description.get("claims", []),
+            "notes": self.description.get("notes", []),
+        }
+        write_atomically(path, json.dumps(content, indent=1))
+        return path
+
+
+def unique(runs: Sequence[Run]) -> list[Run]:
+    """Each run once, in the order of their first mention."""
+    return list({run.run_id: run for run in runs}.values())
+
+
+def load_figure(figure: str) -> dict[str, Any]:
+    """conf/figure/<figure>.yaml."""
+    check_choice("figure", figure, choices("figure"))
+    return yaml.safe_load((CONF / "figure" / f"{figure}.yaml").read_text())
+
+
+def env_label(env: str) -> str:
+    """How figures call an environment."""
+    return yaml.safe_load((CONF / "env" / f"{env}.yaml").read_text())["label"]
+
+
+def committed_runs(figure: str, scale: str) -> set[str]:
+    """Ids of the runs whose rows are committed for this figure and scale."""
+    path = COMMITTED / scale / f"{figure}.csv"
+    if not path.exists():
+        return set()
+    with path.open() as file:
+        return {row["run_id"] for row in csv.DictReader(file)}
+
+
+def make_plan(figure: str, scale: str, settings: Sequence[str], fresh: bool, runs_dir: Path) -> Plan:
+    """Resolve a figure into runs and look up how each is doing."""
+    description = load_figure(figure)
+    check_choice("scale", scale, choices("scale"))
+    for setting in settings:
+        if (key := setting.partition("=")[0]) in FIXED:
+            raise ConfigError(f"set {key}", setting.partition("=")[2], f"{figure} and the sweep's options decide {key}")
+    seeds = yaml.safe_load((CONF / "scale" / f"{scale}.yaml").read_text())["seeds"]
+    committed = set() if fresh else committed_runs(figure, scale)
+    left_out = description.get("not_trained", {}).get(scale, [])
+    entries = []
+    for env in (env for env in description["environments"] if env not in left_out):
+        label, of_env = env_label(env), description.get("environment_settings", {}).get(env, [])
+        for variant, what in description["variants"].items():
+            if env not in what.get("environments", [env]):
+                continue
+            chosen = [f"env={env}", f"algo={what['algo']}", f"scale={scale}", f"runs_dir={runs_dir}"]
+            kind = what.get("kind", description.get("kind"))
+            first = compose_run([*chosen, *of_env, *what.get("settings", []), *settings])
+            if kind is not None:
+                evaluation = description["evaluation"] if kind == "evaluate" else None
+                first = dataclasses.replace(first, kind=kind, evaluation=evaluation)
+            for seed in range(seeds):
+                run = dataclasses.replace(first, seed=seed)
+                state = read_status(run.folder)["state"]
+                if state != "finished" and run.run_id in committed:
+                    state = "committed"
+                entries.append(Entry(run, label, variant, what["label"], state))
+    return Plan(figure, scale, description, fresh, entries)
+
+
+def summary(plan: Plan) -> str:
+    """One paragraph: how many runs, how they are doing, what is left to pay."""
+    states = Counter(e.state for e in {e.run.run_id: e for e in plan.entries}.values())
+    counts = ", ".join(f"{number} {state}" for state, number in sorted(states.items()))
+    todo, table = plan.todo(), costs.known()
+    return (
+        f"{plan.figure} at scale {plan.scale}: {sum(states.values())} runs ({counts}); to train: {len(todo)} runs, "
+        f"{sum(run.env_steps for run in todo):,} environment steps, "
+        f"about {duration(sum(costs.seconds(run, table) for run in todo))} on one core"
+    )
+
+
+COLUMNS = ("figure", "runs", "shared", "done", "running", "failed", "missing", "env steps", "core-hours", "disk")
+
+
+def overview(plans: Sequence[Plan], workers: int) -> str:
+    """A table with a line per figure and the total of what is left, every run counted once.
+
+    `runs` counts those that a figure depends on too, `shared` those that another figure of the table also needs; the
+    remaining columns are about what is left to do.
+    """
+    table = costs.calibrate([run for plan in plans for run in plan.runs()])
+    uses = Counter(run.run_id for plan in plans for run in plan.runs())
+    lines, all_todo = [], []
+    everything: dict[str, str] = {}
+    for plan in plans:
+        own = {e.run.run_id: e.state for e in plan.entries}
+        states = {r.run_id: own.get(r.run_id) or _state(r, plan.fresh) for r in plan.runs()}
+        everything |= states
+        all_todo += plan.todo()
+        shared = sum(uses[run_id] > 1 for run_id in states)
+        lines.append(_line(plan.figure, states, shared, plan.todo(), table))
+    todo = unique(all_todo)
+    lines.append(_line("together", everything, sum(n > 1 for n in uses.values()), todo, table))
+    seconds = sum(costs.seconds(run, table) for run in todo)
+    chains = (sum(costs.seconds(r, table) for r in [run, *run.ancestors] if r in todo) for run in todo)
+    days = sorted({costs.cost(run, table).measured for plan in plans for run in plan.runs()} - {""})
+    notes = [
+        f"wall-clock with {workers} processes: at least {duration(max([seconds / workers, *chains]))}",
+        f"seconds per step measured on {costs.cpu_name()}, {', '.join(days)} ({costs.cache_file()})",
+    ]
+    return "\n".join([_row(COLUMNS), *lines, *notes])
+
+
+def _state(run: Run, fresh: bool) -> str:
+    state = read_status(run.folder)["state"]
+    return "committed" if state != "finished" and is_there(run, fresh) else state
+
+
+def _line(name: str, states: dict[str, str], shared: int, todo: Sequence[Run], table: dict[str, Any]) -> str:
+    count = Counter(states.values())
+    failed = sum(count[state] for state in ("failed", "diverged", "lost", "preempted"))
+    done, running = sum(count[state] for state in DONE), count["running"] + count["pending"]
+    steps, seconds = sum(run.env_steps for run in todo), sum(costs.seconds(run, table) for run in todo)
+    disk = sum(costs.disk(run, table) for run in todo)
+    numbers = (len(states), shared, done, running, failed, len(states) - done - running - failed)
+    return _row((name, *numbers, f"{steps / 1e6:,.1f} M", f"{seconds / 3600:,.2f}", f"{disk / 1e6:,.1f} MB"))
+
+
+def _row(cells: Sequence[Any]) -> str:
+    widths = (9, 6, 7, 6, 8, 7, 8, 12, 11, 11)
+    return "".join(
+        f"{cell:<{w}}" if i == 0 else f"{cell:>{w}}" for i, (cell, w) in enumerate(zip(cells, widths, strict=True))
+    )
