@@ -3,12 +3,14 @@
 import dataclasses
 import json
 import os
+import random
 import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
 
+import psutil
 import pytest
 
 from experiments import launchers, sweep, train
@@ -24,19 +26,26 @@ FIGURE = {
     "environments": ["block_hopper"],
     "variants": {"hippo": {"label": "HiPPO", "algo": "hippo"}, "ppo": {"label": "PPO", "algo": "ppo"}},
 }
-SCRIPT = f"""
+EIGHT = FIGURE | {
+    "variants": {
+        f"{algo}_{gamma}": {"label": algo, "algo": algo, "settings": [f"algo.gamma={gamma}"]}
+        for algo in ("hippo", "ppo")
+        for gamma in (0.9, 0.99)
+    }
+}
+SCRIPT = """
 if __name__ == "__main__":  # workers import this file again
     import sys
     from experiments import plan, sweep
-    plan.load_figure = lambda name: {FIGURE!r}
+    plan.load_figure = lambda name: FIGURE
     sys.exit(sweep.main(sys.argv[1:]))
 """
 
 
-def start_sweep(tmp_path, iterations):
-    """A sweep of four runs in a process of its own."""
+def start_sweep(tmp_path, iterations, figure=FIGURE):
+    """A sweep in a process of its own, of four runs unless `figure` has more."""
     script = tmp_path / "tiny_sweep.py"
-    script.write_text(SCRIPT)
+    script.write_text(SCRIPT.replace("FIGURE", repr(figure)))
     arguments = ["run", "tiny", "--runs-dir", str(tmp_path / "runs"), "--workers", "2"]
     settings = ["--set", f"iterations={iterations}", "--set", "batch_size=400"]
     return subprocess.Popen(
@@ -70,6 +79,36 @@ def test_two_sweeps_started_together_train_every_run_once_and_both_succeed(tmp_p
         assert (folder / "train.log").read_text().count("iteration 6/6") == 1
         assert (folder / "progress.csv").read_text().count("\n") == 7
     assert not list((tmp_path / "runs").rglob("*.tmp"))
+
+
+def finished(tmp_path):
+    return {p.parent.name for p in (tmp_path / "runs").glob("*/status.json") if '"finished"' in p.read_text()}
+
+
+def test_six_workers_killed_at_random_leave_no_trace_once_the_command_was_typed_again(tmp_path):
+    (tmp_path / "a").mkdir()
+    (tmp_path / "b").mkdir()
+    assert start_sweep(tmp_path / "a", 25, EIGHT).wait(100) == 0
+    rng, kills, typed, process = random.Random(0), 0, 0, None
+    deadline = time.monotonic() + 100
+    while len(finished(tmp_path / "b")) < 8 or kills < 6:
+        assert time.monotonic() < deadline
+        if process is None or process.poll() is not None:
+            process, typed = start_sweep(tmp_path / "b", 25, EIGHT), typed + 1
+        time.sleep(rng.uniform(0.2, 1.0))
+        workers = [w for w in psutil.Process(process.pid).children() if "spawn_main" in " ".join(w.cmdline())]
+        folders = [path.parent for path in (tmp_path / "b/runs").glob("*/status.json")]
+        training = {status["pid"] for status in map(read_status, folders) if status["state"] == "running"}
+        if kills < 6 and (chosen := [w for w in workers if w.pid in training]):
+            rng.choice(chosen).kill()
+            kills += 1
+    assert process.wait(60) == 0 or start_sweep(tmp_path / "b", 25, EIGHT).wait(60) == 0
+    assert typed >= 2
+    for folder in (tmp_path / "a/runs").glob("*/status.json"):
+        for name in ("progress.csv", "checkpoint.pt"):
+            other = tmp_path / "b/runs" / folder.parent.name / name
+            assert other.read_bytes() == (folder.parent / name).read_bytes()
+    assert len(finished(tmp_path / "a")) == 8
 
 
 def test_a_terminated_sweep_leaves_every_run_resumable_and_no_orphan(tmp_path):
