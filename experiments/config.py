@@ -34,10 +34,11 @@ ALGORITHMS = {
     "hippo": ("hippo.hippo", "HippoConfig"),
     "ppo": ("baselines.ppo", "PPOConfig"),
     "hier_vpg": ("baselines.hier_vpg", "HierVPGConfig"),
+    "mlsh": ("baselines.mlsh", "MLSHConfig"),
 }
 BUDGET_FIELDS = ("iterations", "batch_size", "horizon")
 # Filled in from the run level, or descriptions that no override should touch.
-NOT_OVERRIDDEN = {"budget", "seeds", "scale", "env.name", "env.label", "env.seconds_per_step"} | {
+NOT_OVERRIDDEN = {"budget", "off_policy", "seeds", "scale", "env.name", "env.label", "env.seconds_per_step"} | {
     f"algo.{name}" for name in BUDGET_FIELDS
 }
 KINDS = ("train", "pretrain", "evaluate", "measure")
@@ -72,6 +73,14 @@ class Budget:
 
 
 @dataclass
+class OffPolicyBudget:
+    """What an off-policy learner (HIRO) gets at one scale, whatever the environment."""
+
+    iterations: int = MISSING
+    batch_size: int = MISSING
+
+
+@dataclass
 class WandbConfig:
     """The mirror to Weights & Biases."""
 
@@ -91,6 +100,7 @@ class RunSchema:
     batch_size: int = MISSING
     runs_dir: str = MISSING
     budget: dict[str, Budget] = field(default_factory=dict)
+    off_policy: OffPolicyBudget = field(default_factory=OffPolicyBudget)
     wandb: WandbConfig = field(default_factory=WandbConfig)
 
 
@@ -323,7 +333,7 @@ def _apply(config: DictConfig, override: Override) -> None:
 def _keys(node: DictConfig, prefix: str = "") -> Iterator[str]:
     for name in map(str, node):
         key, child = f"{prefix}{name}", node._get_node(name)
-        if isinstance(child, DictConfig) and name != "budget":
+        if isinstance(child, DictConfig) and name not in ("budget", "off_policy"):
             yield from _keys(child, f"{key}.")
         elif key not in NOT_OVERRIDDEN:
             yield key

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from baselines import hier_vpg, ppo
+from baselines import hier_vpg, mlsh, ppo
 from hippo import hippo
 from hippo.core import seeding
 from hippo.core.checkpoint import Checkpoint, load
@@ -24,6 +24,14 @@ LEARNERS = {
         {"num_skills": 3, "period_min": 1, "period_max": 1, "skill_baseline": "single"},
     ),
     "hier_vpg": (hier_vpg.train, hier_vpg.HierVPGConfig, {"num_skills": 3, "period_min": 5, "period_max": 5}),
+    "mlsh": (
+        mlsh.train,
+        mlsh.MLSHConfig,
+        {
+            **{"num_skills": 3, "period_min": 5, "period_max": 5, "skill_learning_rate": 3e-3},
+            **{"warmup_iterations": 1, "joint_iterations": 8, "manager_minibatch_size": 16, "skill_minibatches": 3},
+        },
+    ),
     "ppo": (ppo.train, ppo.PPOConfig, {"hidden_sizes": [32, 32]}),
     "ppo with action repeat": (ppo.train, ppo.PPOConfig, {"hidden_sizes": [32, 32], "action_repeat": 4}),
 }
@@ -165,13 +173,11 @@ def test_a_nan_in_the_parameters_stops_the_run_within_the_iteration_and_reaches_
     name, tmp_path, monkeypatch
 ):
     train, config = learner(name, iterations=3, batch_size=200)
-    step, calls = torch.optim.Adam.step, 0
+    step = torch.optim.Adam.step
 
     def poisoned(self, *arguments):
-        nonlocal calls
-        calls += 1
         step(self, *arguments)
-        if calls == config.__dict__.get("updates", 1) + 1:  # in the second iteration
+        if (tmp_path / "checkpoint.pt").exists():  # in the second iteration
             with torch.no_grad():
                 self.param_groups[0]["params"][0].view(-1)[0] = float("nan")
 
