@@ -1,5 +1,7 @@
 """One thread everywhere, as in a training process, so that what the tests compare bit by bit is comparable."""
 
+import experiments  # noqa: F401, I001  first: it says so to numpy's BLAS, which listens only when it is imported
+
 import pytest
 import torch
 
