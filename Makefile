@@ -1,5 +1,5 @@
 # The front door. `make help` lists the targets; every target installs what it needs first.
-#   SCALE=smoke|laptop|paper   LAUNCHER=local|slurm   FRESH=1 (ignore committed results)   YES=1 (agree to large plans)
+#   SCALE=smoke|laptop|paper   LAUNCHER=local|slurm [PROFILE=file.yaml]   FRESH=1 (ignore committed results)   YES=1 (agree to large plans)
 
 SHELL := /bin/bash
 .DELETE_ON_ERROR:
@@ -13,6 +13,7 @@ BIN := .venv/bin
 RUN = $(BIN)/python -m
 
 SWEEP_FLAGS = --scale $(SCALE) --launcher $(LAUNCHER) --runs-dir $(RUNS_DIR) $(if $(FRESH),--fresh) $(if $(YES),--yes)
+SWEEP_FLAGS += $(if $(filter slurm,$(LAUNCHER)),--wait) $(if $(PROFILE),--profile $(PROFILE))
 DRAW_FLAGS = --scale $(SCALE) --runs-dir $(RUNS_DIR)
 
 FIGURES := $(filter fig%,$(basename $(notdir $(wildcard paper_figures/fig*.py))))
@@ -47,6 +48,10 @@ lint: install  ## ruff (format and rules) and mypy
 test: install  ## every test but the slow ones
 	$(RUN) pytest -m "not slow and not slurm"
 
+test-slurm: install  ## the launcher on a real one-node Slurm, installed by apt (as root) where it is missing
+	@$(RUN) tests.slurm.cluster install || echo "no Slurm here and none to be installed: its tests are skipped" >&2
+	$(RUN) pytest -m slurm tests/slurm
+
 smoke: fig3  ## train and draw Figure 3 at smoke scale
 
 bench: install  ## steps per second as ratios within one run, with a table
@@ -61,4 +66,4 @@ help:  ## this list
 	@echo "  make tableN      the same for: $(or $(TABLES),none yet)"
 	@echo "  make plan-figN   what it would train and cost, without training"
 
-.PHONY: install all report lint test smoke bench clean help $(FIGURES) $(TABLES)
+.PHONY: install all report lint test test-slurm smoke bench clean help $(FIGURES) $(TABLES)

@@ -35,6 +35,7 @@ ALGORITHMS = {
     "ppo": ("baselines.ppo", "PPOConfig"),
     "hier_vpg": ("baselines.hier_vpg", "HierVPGConfig"),
     "mlsh": ("baselines.mlsh", "MLSHConfig"),
+    "option_critic": ("baselines.option_critic", "OptionCriticConfig"),
 }
 BUDGET_FIELDS = ("iterations", "batch_size", "horizon")
 # Filled in from the run level, or descriptions that no override should touch.

@@ -25,7 +25,7 @@ from hippo.core.log import RunLog
 HORIZON = 1000
 PUBLISHED = (2000, 2250)  # PPOC, Hopper-v1, two options, 10^6 steps, all deliberation costs
 # Two environments for a whole horizon each: 2000 steps between updates, where PPOC has 2048.
-BUDGET = {"iterations": 500, "batch_size": 2 * HORIZON, "horizon": HORIZON}
+BUDGET: dict[str, Any] = {"iterations": 500, "batch_size": 2 * HORIZON, "horizon": HORIZON}
 VARIANTS: dict[str, dict[str, Any]] = {
     "option_critic": {"num_skills": 2, "log_std_per_skill": True},
     "option_critic_ppoc": {"num_skills": 2, "log_std_per_skill": True, "ppoc_faithful": True},

@@ -24,10 +24,20 @@ def git(*arguments: str) -> str:
     return result.stdout.strip()
 
 
+def code_version() -> dict[str, str | None]:
+    """The commit and a digest of what differs from it; of a copy of the code, what was noted when it was made."""
+    if (ROOT / "snapshot.json").exists():
+        return json.loads((ROOT / "snapshot.json").read_text())
+    difference = git("diff", "HEAD")
+    return {
+        "git_commit": git("rev-parse", "HEAD"),
+        "git_difference": sha256(difference.encode()).hexdigest() if difference else None,
+    }
+
+
 def manifest(run: Run) -> dict[str, Any]:
     """Where a run comes from: code, versions, machine, command. Holds no host name, user or environment."""
     lock = ROOT / "requirements.lock"
-    difference = git("diff", "HEAD")
     cpu = dict(line.split("\t", 1) for line in Path("/proc/cpuinfo").read_text().splitlines() if "\t" in line)
     return {
         "schema": 1,
@@ -36,8 +46,7 @@ def manifest(run: Run) -> dict[str, Any]:
         "identity": run.identity,
         "config": run.to_yaml(),
         "command": shlex.join(["python", *sys.orig_argv[1:]]),
-        "git_commit": git("rev-parse", "HEAD"),
-        "git_difference": sha256(difference.encode()).hexdigest() if difference else None,
+        **code_version(),
         "lock": sha256(lock.read_bytes()).hexdigest() if lock.exists() else None,
         "python": platform.python_version(),
         "versions": {name: version(name) for name in ("torch", "mujoco", "gymnasium", "numpy", "scipy")},

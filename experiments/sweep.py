@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from experiments import costs
+from experiments import costs, slurm
 from experiments.command_line import EXIT_FAILED, EXIT_REQUEUE, Parser, bad_input, clock
 from experiments.config import Run, check_choice, choices
 from experiments.launchers import run_locally
@@ -22,7 +22,7 @@ from experiments.plan import Plan, make_plan, overview, summary
 from experiments.status import DONE, read_status
 from hippo.core.settings import ConfigError
 
-LAUNCHERS = ("local",)
+LAUNCHERS = ("local", "slurm")
 REPORT_SECONDS = 10.0  # between two progress lines
 MAX_ATTEMPTS = 3  # of a run that the machine made fail, before `retry` leaves it alone
 
@@ -49,7 +49,10 @@ def train_all(todo: Sequence[Run], workers: int, report: Callable[[int, int], No
     return states
 
 
-def run_figure(plan: Plan, todo: Sequence[Run], workers: int, runs_dir: Path) -> int:
+TrainAll = Callable[[Sequence[Run], Callable[[int, int], None]], dict[str, str]]
+
+
+def run_figure(plan: Plan, todo: Sequence[Run], train: TrainAll, runs_dir: Path) -> int:
     """Do `todo`, write the plan with what became of it, and name what failed; returns the exit code."""
     started, last_report = time.monotonic(), time.monotonic()
     table = costs.known()
@@ -79,7 +82,7 @@ def run_figure(plan: Plan, todo: Sequence[Run], workers: int, runs_dir: Path) ->
 
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C: every run stays resumable
     try:
-        states = train_all(todo, workers, report)
+        states = train(todo, report)
     except KeyboardInterrupt:
         print("\nstopped; the same command continues where it left off", file=sys.stderr)
         return EXIT_REQUEUE
@@ -105,8 +108,12 @@ def name_failures(plan: Plan, todo: Sequence[Run], states: dict[str, str]) -> in
     return EXIT_FAILED if bad else 0
 
 
-def status_table(plan: Plan) -> str:
-    """A line per run: state, progress, ETA, speed; of those that ended badly also cause, log and what to type."""
+def status_table(plan: Plan, waiting: dict[str, str]) -> str:
+    """A line per run: state, progress, ETA, speed; of those that ended badly also cause, log and what to type.
+
+    Args:
+        waiting: run id -> Slurm job of what is in the queue.
+    """
     columns = f"{'environment':18} {'variant':22} {'seed':>4}  {'state':10} {'iteration':>11} {'ETA':>8} {'steps/s':>9}"
     lines = [f"{'run':12}  {columns}"]
     variants = {e.run.run_id: (e.variant, e.state) for e in plan.entries}
@@ -114,6 +121,8 @@ def status_table(plan: Plan) -> str:
         variant, state = variants.get(run.run_id, (run.kind, ""))
         s = read_status(run.folder)
         state = state if state == "committed" else s["state"]
+        if run.run_id in waiting and state not in (*DONE, "running"):
+            state = "pending"
         done = f"{s.get('iteration', -1) + 1}/{run.config.iterations}"
         speed = f"{s['steps_per_second']:,.0f}" if s.get("steps_per_second") else ""
         eta = clock(s["eta"]) if state == "running" and "eta" in s else ""
@@ -140,24 +149,17 @@ def may_retry(plan: Plan) -> list[Run]:
     return chosen
 
 
-def watch(make: Callable[[], Plan]) -> None:
-    """Print the status table every two seconds until nothing runs or waits any more."""
-    while True:
-        table = status_table(plan := make())
-        print(f"\x1b[2J\x1b[H{table}" if sys.stdout.isatty() else table, flush=True)
-        if not any(read_status(run.folder)["state"] in ("running", "pending") for run in plan.runs()):
-            return
-        time.sleep(2.0)
-
-
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     """The command line."""
     parser = Parser(prog="experiments.sweep", description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("action", choices=("plan", "run", "status", "retry"))
+    parser.add_argument("action", choices=tuple(ACTIONS))
     parser.add_argument("figure", help="a figure or table of conf/figure; `plan` also takes all")
     parser.add_argument("--scale", default="smoke", help="smoke, laptop or paper")
     parser.add_argument("--launcher", default="local", help=", ".join(LAUNCHERS))
     parser.add_argument("--workers", type=int, default=len(os.sched_getaffinity(0)), help="processes, one thread each")
+    parser.add_argument("--profile", type=Path, help="slurm: what jobs ask for (default: conf/slurm/default.yaml)")
+    parser.add_argument("--dry-run", action="store_true", help="slurm: say what would be submitted")
+    parser.add_argument("--wait", action="store_true", help="slurm: return when the jobs have ended, not at once")
     parser.add_argument("--runs-dir", type=Path, default=Path("runs"))
     parser.add_argument("--fresh", action="store_true", help="ignore committed results")
     parser.add_argument("--max-core-hours", type=float, default=100.0, help="refuse to start more than this")
@@ -175,32 +177,63 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return make_plan(figure, options.scale, options.set, options.fresh, options.runs_dir)
 
     try:
-        check_choice("launcher", options.launcher, LAUNCHERS)
-        if options.workers < 1:
-            raise ConfigError("workers", options.workers, "must be at least 1")
-        if options.action == "plan":
-            figures = choices("figure") if options.figure == "all" else [options.figure]
-            print(overview([plan_of(figure) for figure in figures], options.workers))
-            return 0
-        plan = plan_of(options.figure)
-        todo = may_retry(plan) if options.action == "retry" else plan.todo()
-        if options.action == "run" and options.scale != "smoke":
-            costs.calibrate(todo)
-        cost = sum(costs.seconds(run) for run in todo) / 3600
-        if options.action != "status" and cost > options.max_core_hours and not options.yes:
-            valid = f"below the estimate of {cost:,.0f}; raise it or agree with --yes (make ... YES=1)"
-            raise ConfigError("max-core-hours", options.max_core_hours, valid)
+        check_options(options)
+        return ACTIONS[options.action](options, plan_of)
     except ConfigError as error:
         return bad_input(error)
-    if options.action == "status" and options.watch:
-        watch(lambda: plan_of(options.figure))
-        return 0
-    if options.action == "status":
-        print(status_table(plan))
-        return 0
+
+
+def check_options(options: argparse.Namespace) -> None:
+    """Raise ConfigError for what argparse does not check."""
+    check_choice("launcher", options.launcher, LAUNCHERS)
+    if options.workers < 1:
+        raise ConfigError("workers", options.workers, "must be at least 1")
+
+
+def show_plan(options: argparse.Namespace, plan_of: Callable[[str], Plan]) -> int:
+    """`plan`."""
+    figures = choices("figure") if options.figure == "all" else [options.figure]
+    print(overview([plan_of(figure) for figure in figures], options.workers))
+    return 0
+
+
+def show_status(options: argparse.Namespace, plan_of: Callable[[str], Plan]) -> int:
+    """`status`, once or until nothing runs or waits any more."""
+    while True:
+        plan, waiting = plan_of(options.figure), slurm.queued(options.runs_dir)
+        clear = "\x1b[2J\x1b[H" if options.watch and sys.stdout.isatty() else ""
+        print(clear + status_table(plan, waiting), flush=True)
+        active = (r.run_id in waiting or read_status(r.folder)["state"] == "running" for r in plan.runs())
+        if not options.watch or not any(active):
+            return 0
+        time.sleep(2.0)
+
+
+def run_or_retry(options: argparse.Namespace, plan_of: Callable[[str], Plan]) -> int:
+    """`run` and `retry`; refuses what costs too much, before anything is written."""
+    plan = plan_of(options.figure)
+    todo = plan.todo() if options.action == "run" else may_retry(plan)
+    profile = slurm.load_profile(options.profile) if options.launcher == "slurm" else None
+    if options.action == "run" and options.scale != "smoke":
+        costs.calibrate(todo)
+    cost = sum(costs.seconds(run) for run in todo) / 3600
+    if cost > options.max_core_hours and not options.yes and not options.dry_run:
+        valid = f"below the estimate of {cost:,.0f}; raise it or agree with --yes (make ... YES=1)"
+        raise ConfigError("max-core-hours", options.max_core_hours, valid)
     print(summary(plan), flush=True)
+    if profile is None:
+        plan.write(options.runs_dir)
+        return run_figure(plan, todo, lambda runs, report: train_all(runs, options.workers, report), options.runs_dir)
+    slurm.submit(todo, options.runs_dir, profile, options.dry_run)
+    if options.dry_run:
+        return 0
     plan.write(options.runs_dir)
-    return run_figure(plan, todo, options.workers, options.runs_dir)
+    if not options.wait:
+        return 0
+    return run_figure(plan, todo, lambda runs, report: slurm.wait(runs, options.runs_dir, report), options.runs_dir)
+
+
+ACTIONS = {"plan": show_plan, "run": run_or_retry, "status": show_status, "retry": run_or_retry}
 
 
 if __name__ == "__main__":

@@ -38,7 +38,7 @@ EXIT_CODES = {"finished": 0, "running": 0, "failed": EXIT_FAILED, "diverged": EX
 
 
 class Preempted(BaseException):
-    """SIGTERM or SIGUSR1 arrived: the iteration is abandoned; the last checkpoint is complete."""
+    """A signal to stop arrived: the iteration is abandoned; the last checkpoint is complete."""
 
 
 def execute(run: Run) -> str:
@@ -104,12 +104,12 @@ def _execute_locked(run: Run) -> str:
 
 @contextlib.contextmanager
 def _preemption() -> Iterator[None]:
-    """Turn SIGTERM and SIGUSR1 into Preempted while the block runs."""
+    """Turn SIGTERM, SIGUSR1 and SIGUSR2 (submitit's) into Preempted while the block runs."""
 
     def stop(number: int, frame: object) -> None:
         raise Preempted(signal.Signals(number).name)
 
-    before = {number: signal.signal(number, stop) for number in (signal.SIGTERM, signal.SIGUSR1)}
+    before = {number: signal.signal(number, stop) for number in (signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2)}
     try:
         yield
     finally:

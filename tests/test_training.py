@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from baselines import hier_vpg, mlsh, ppo
+from baselines import hier_vpg, mlsh, option_critic, ppo
 from hippo import hippo
 from hippo.core import seeding
 from hippo.core.checkpoint import Checkpoint, load
@@ -28,9 +28,32 @@ LEARNERS = {
         mlsh.train,
         mlsh.MLSHConfig,
         {
-            **{"num_skills": 3, "period_min": 5, "period_max": 5, "skill_learning_rate": 3e-3},
-            **{"warmup_iterations": 1, "joint_iterations": 8, "manager_minibatch_size": 16, "skill_minibatches": 3},
+            "num_skills": 3,
+            "period_min": 5,
+            "period_max": 5,
+            "warmup_iterations": 1,
+            "joint_iterations": 8,
+            "skill_learning_rate": 3e-3,
+            "manager_minibatch_size": 16,
+            "skill_minibatches": 3,
         },
+    ),
+    "option_critic": (
+        option_critic.train,
+        option_critic.OptionCriticConfig,
+        {
+            "num_skills": 3,
+            "steps_per_update": 1000,
+            "minibatch_size": 100,
+            "critic_minibatch_size": 100,
+            "learning_rate": 2e-3,
+            "deliberation_cost": 0.1,
+        },
+    ),
+    "option_critic with PPOC's losses": (
+        option_critic.train,
+        option_critic.OptionCriticConfig,
+        {"num_skills": 3, "minibatch_size": 200, "learning_rate": 3e-3, "ppoc_faithful": True},
     ),
     "ppo": (ppo.train, ppo.PPOConfig, {"hidden_sizes": [32, 32]}),
     "ppo with action repeat": (ppo.train, ppo.PPOConfig, {"hidden_sizes": [32, 32], "action_repeat": 4}),

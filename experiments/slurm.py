@@ -1,0 +1,306 @@
+"""Sweeps on Slurm: arrays of jobs that survive pre-emption and time limits, submitted through submitit.
+
+submitit carries a job to its node and nothing else. What is true stands in our own files: the run folders (status,
+lock, checkpoint) and, for what waits in the queue, `<runs_dir>/slurm/batches/<job name>.json`: a list of run ids for
+every array index, written before sbatch is called. One squeue call then says which runs Slurm still means to do, so a
+second `run` submits nothing twice, even if the first was killed between sbatch and its bookkeeping.
+"""
+
+import contextlib
+import dataclasses
+import getpass
+import hashlib
+import json
+import os
+import shlex
+import shutil
+import subprocess
+import time
+import uuid
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import submitit
+import yaml
+from filelock import FileLock
+
+from experiments import costs
+from experiments.command_line import duration
+from experiments.config import CONF, Run, nearest
+from experiments.manifest import ROOT, code_version, git
+from experiments.status import read_status, write_atomically
+from experiments.train import execute
+from hippo.core.settings import ConfigError, check, setting
+
+POLL_SECONDS = 5.0
+LIVE = {
+    *("PENDING", "RUNNING", "COMPLETING", "CONFIGURING", "SUSPENDED", "REQUEUED", "REQUEUE_HOLD", "REQUEUE_FED"),
+    *("RESIZING", "SIGNALING", "STAGE_OUT", "STOPPED", "SPECIAL_EXIT", "RESV_DEL_HOLD"),
+}
+
+
+@dataclass
+class Profile:
+    """What a job asks for; conf/slurm/default.yaml."""
+
+    partition: str | None = setting(None, "partition, null for the cluster's default")
+    account: str | None = setting(None, "account")
+    constraint: str | None = setting(None, "constraint on nodes, e.g. a CPU model")
+    time_minutes: int = setting(240, "time limit of a job; two at least, for the signal may come a minute early", low=2)
+    memory_gb: float = setting(2.0, "memory of a job", above=0.0)
+    cpus: int = setting(1, "CPUs of a job", low=1)
+    parallel: int = setting(100, "jobs of one array that may run at the same time", low=1)
+    group_minutes: int = setting(60, "short runs share a job of about this length; 0: a job each", low=0)
+    signal_seconds: int = setting(60, "seconds before the limit at which a job is told to stop", low=10)
+
+    def __post_init__(self) -> None:
+        check(self)
+
+
+def load_profile(path: Path | None) -> Profile:
+    """Read a profile, by default conf/slurm/default.yaml.
+
+    Raises:
+        ConfigError: no such file, no such key, a value out of range.
+    """
+    path = CONF / "slurm" / "default.yaml" if path is None else path
+    try:
+        content = yaml.safe_load(path.read_text())
+    except (OSError, yaml.YAMLError) as error:
+        raise ConfigError("profile", path, f"must be a yaml file ({error})") from error
+    valid = [f.name for f in dataclasses.fields(Profile)]
+    if not isinstance(content, dict):
+        raise ConfigError("profile", path, f"must set some of {', '.join(valid)}")
+    for key in content:
+        if key not in valid:
+            raise ConfigError(f"profile {key}", content[key], nearest(str(key), valid))
+    return Profile(**content)
+
+
+class Job:
+    """What a node does: runs one after another; it is pickled by submitit and holds text and a path only."""
+
+    def __init__(self, runs_dir: Path) -> None:
+        self.runs_dir = str(runs_dir)
+
+    def __call__(self, group: Sequence[str]) -> dict[str, str]:
+        """Do the runs of `group`, given as their yaml; told to stop, put this job back into the queue.
+
+        Raises:
+            RuntimeError: a run failed, so that Slurm shows the job as failed too.
+        """
+        states: dict[str, str] = {}
+        for text in group:
+            run = Run.from_yaml(text, Path(self.runs_dir))
+            states[run.run_id] = execute(run)
+            if states[run.run_id] == "preempted":
+                requeue_unless_cancelled(run)
+                break
+        failed = [run_id for run_id, state in states.items() if state not in ("finished", "running")]
+        if failed:
+            raise RuntimeError(f"not finished: {', '.join(failed)}")
+        return states
+
+
+def requeue_unless_cancelled(run: Run) -> None:
+    """After the warning signal of a time limit or a pre-emption, ask Slurm for this job again and wait for the end.
+
+    SIGTERM alone is scancel's, or a pre-emption after which Slurm requeues by itself.
+    """
+    if "SIGUSR" not in read_status(run.folder)["message"]:
+        return
+    environment = os.environ
+    job = environment["SLURM_JOB_ID"]
+    if "SLURM_ARRAY_JOB_ID" in environment:
+        job = f"{environment['SLURM_ARRAY_JOB_ID']}_{environment['SLURM_ARRAY_TASK_ID']}"
+    subprocess.run(["scontrol", "requeue", job], check=True, timeout=60)
+    time.sleep(60)  # Slurm ends us; to return now would read as the job's result
+
+
+# ---------------------------------------------------------------------------------------------------------- submission
+
+
+def submit(runs: Sequence[Run], runs_dir: Path, profile: Profile, dry_run: bool) -> int:
+    """Queue `runs`, parents before what depends on them, and return at once; the number of runs submitted.
+
+    Runs that already wait in the queue or are being trained are left alone.
+
+    Raises:
+        ConfigError: Slurm is not here or refuses.
+    """
+    folder = runs_dir.absolute() / "slurm"
+    with _private(folder), FileLock(folder / "submit.lock"):
+        live = queued(runs_dir)
+        todo = [run for run in runs if run.run_id not in live and read_status(run.folder)["state"] != "running"]
+        table, size = costs.known(), max_array_size()
+        before: list[str] = []
+        for wave in waves(todo):
+            groups = grouped(wave, profile.group_minutes * 60, table)
+            jobs = []
+            for start in range(0, len(groups), size):
+                part = groups[start : start + size]
+                _describe(part, profile, table, before)
+                if not dry_run:
+                    jobs.append(_submit_array(part, folder, runs_dir.absolute(), profile, before))
+            before = jobs
+        done = "to submit" if dry_run else "submitted"
+        print(f"{len(runs) - len(todo)} already queued or running, {len(todo)} {done}")
+    return len(todo)
+
+
+@contextlib.contextmanager
+def _private(folder: Path) -> Iterator[None]:
+    """Job folders hold pickles that the nodes will execute, so nobody else may write or read there."""
+    before = os.umask(0o077)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        folder.chmod(0o700)
+        yield
+    finally:
+        os.umask(before)
+
+
+def waves(runs: Sequence[Run]) -> list[list[Run]]:
+    """Runs by how many of their ancestors are among `runs`: what a wave needs is in the waves before it."""
+    chosen = {run.run_id for run in runs}
+    depth = {run.run_id: sum(a.run_id in chosen for a in run.ancestors) for run in runs}
+    return [[run for run in runs if depth[run.run_id] == d] for d in sorted(set(depth.values()))]
+
+
+def grouped(runs: Sequence[Run], seconds: float, table: dict[str, Any]) -> list[list[Run]]:
+    """Runs packed in order into jobs of at most about `seconds`, or of one longer run."""
+    groups: list[list[Run]] = []
+    filled = float("inf")
+    for run in sorted(runs, key=lambda run: -costs.seconds(run, table)):
+        cost = costs.seconds(run, table)
+        if filled + cost > seconds:
+            groups.append([])
+            filled = 0.0
+        groups[-1].append(run)
+        filled += cost
+    return groups
+
+
+def _describe(groups: list[list[Run]], profile: Profile, table: dict[str, Any], before: list[str]) -> None:
+    longest = max(sum(costs.seconds(run, table) for run in group) for group in groups)
+    asked = {f.name: getattr(profile, f.name) for f in dataclasses.fields(profile)}
+    wanted = ", ".join(f"{name} {value}" for name, value in asked.items() if value is not None)
+    behind = f", after {', '.join(before)}" if before else ""
+    size = f"array of {len(groups)} jobs, {sum(map(len, groups))} runs"
+    print(f"{size}, the longest {duration(longest)}{behind}: {wanted}")
+
+
+def _submit_array(groups: list[list[Run]], folder: Path, runs_dir: Path, profile: Profile, before: list[str]) -> str:
+    """One sbatch; returns the id of the array."""
+    name = f"hippo-{uuid.uuid4().hex[:10]}"
+    code = snapshot(folder)
+    batches = folder / "batches"
+    batches.mkdir(exist_ok=True)
+    write_atomically(batches / f"{name}.json", json.dumps([[run.run_id for run in group] for group in groups]))
+    executor = submitit.AutoExecutor(folder=folder / "log" / "%j", cluster="slurm", slurm_max_num_timeout=10_000)
+    executor.update_parameters(
+        name=name,
+        timeout_min=profile.time_minutes,
+        mem_gb=profile.memory_gb,
+        cpus_per_task=profile.cpus,
+        slurm_signal_delay_s=profile.signal_seconds,
+        slurm_array_parallelism=profile.parallel,
+        slurm_setup=[
+            f"export PYTHONPATH={shlex.quote(str(code))}",
+            f"cd {shlex.quote(str(code))}",
+            "export SRUN_CPUS_PER_TASK=$SLURM_CPUS_PER_TASK",  # srun no longer inherits it
+        ],
+        slurm_additional_parameters={"requeue": True} | _dependency(before),
+        **{f"slurm_{key}": value for key in ("partition", "account", "constraint") if (value := getattr(profile, key))},
+    )
+    try:
+        jobs = executor.map_array(Job(runs_dir), [[run.to_yaml() for run in group] for group in groups])
+    except submitit.core.utils.FailedJobError as error:
+        raise ConfigError("launcher", "slurm", f"sbatch refused: {' '.join(str(error).split())}") from error
+    return jobs[0].job_id.split("_")[0]
+
+
+def _dependency(before: list[str]) -> dict[str, str]:
+    """Behind jobs that ended in any way: a run whose parent is not there does it first, or fails with its message."""
+    return {"dependency": f"afterany:{':'.join(before)}"} if before else {}
+
+
+def snapshot(folder: Path) -> Path:
+    """A copy of the code as it is now, which queued jobs run whatever happens to the working tree meanwhile."""
+    names = git("ls-files", "--cached", "--others", "--exclude-standard").splitlines()
+    files = [ROOT / name for name in names] or [p for p in ROOT.rglob("*") if ".venv" not in p.parts]
+    files = sorted(p for p in files if p.is_file())
+    digest = hashlib.sha256()
+    for path in files:
+        digest.update(str(path.relative_to(ROOT)).encode() + b"\0" + path.read_bytes())
+    target = folder / f"code-{digest.hexdigest()[:12]}"
+    if not target.exists():
+        temporary = folder / f"{target.name}.{os.getpid()}.tmp"
+        for path in files:
+            copy = temporary / path.relative_to(ROOT)
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(path, copy)
+        (temporary / "snapshot.json").write_text(json.dumps(code_version()))
+        temporary.rename(target)
+    return target
+
+
+# --------------------------------------------------------------------------------------------------------------- queue
+
+
+def _ask(*command: str) -> str:
+    """Output of a Slurm command.
+
+    Raises:
+        ConfigError: it is not installed, or the controller does not answer.
+    """
+    try:
+        return subprocess.run(command, check=True, capture_output=True, text=True, timeout=60).stdout
+    except FileNotFoundError as error:
+        raise ConfigError(
+            "launcher", "slurm", f"needs Slurm's {command[0]} on this machine; valid here: local"
+        ) from error
+    except (subprocess.CalledProcessError, subprocess.TimeoutExpired) as error:
+        message = getattr(error, "stderr", None) or str(error)
+        raise ConfigError("launcher", "slurm", f"{command[0]} failed: {' '.join(message.split())}") from error
+
+
+def max_array_size() -> int:
+    """How many jobs one array may have."""
+    lines = _ask("scontrol", "show", "config").splitlines()
+    return next(int(line.split("=")[1]) for line in lines if line.startswith("MaxArraySize")) - 1
+
+
+def queued(runs_dir: Path) -> dict[str, str]:
+    """Run id -> job of every run that Slurm still means to do."""
+    batches = runs_dir / "slurm" / "batches"
+    if not batches.exists():
+        return {}
+    live: dict[str, str] = {}
+    for line in _ask("squeue", "-h", "-r", "-u", getpass.getuser(), "-o", "%j|%K|%F|%T").splitlines():
+        name, index, job, state = line.split("|")
+        path = batches / f"{name}.json"
+        if state in LIVE and path.exists():
+            groups = json.loads(path.read_text())
+            live |= dict.fromkeys(groups[int(index) if index.isdigit() else 0], f"{job}_{index}")
+    return live
+
+
+def wait(runs: Sequence[Run], runs_dir: Path, report: Callable[[int, int], None]) -> dict[str, str]:
+    """Watch the run folders until Slurm has nothing more to do with `runs`; the final state of each.
+
+    Args:
+        report: called at every look with the number of runs in progress and of those that ended.
+    """
+    gone: set[str] = set()
+    while True:
+        live = queued(runs_dir)
+        states = {run.run_id: read_status(run.folder)["state"] for run in runs}
+        ended = {i for i, state in states.items() if state in ("finished", "diverged") or i not in live}
+        report(sum(state == "running" for state in states.values()), len(ended))
+        if ended <= gone and len(ended) == len(states):  # seen twice: a job between two states is in no list
+            return {i: "lost" if state in ("running", "missing") else state for i, state in states.items()}
+        gone = ended
+        time.sleep(POLL_SECONDS)

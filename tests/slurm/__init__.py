@@ -1,0 +1,1 @@
+"""Tests of the Slurm launcher on a real one-node Slurm."""
