@@ -48,7 +48,7 @@ KIND_REVISIONS = {"measure": 1, "evaluate": 1}
 PRETRAINING = {"ant": "snn", "snake": "snn", "hopper": "diayn", "half_cheetah": "diayn"}  # robot -> algorithm
 PRETRAINED = "pretrained"  # value of algo.skills: the skills that the robot's pre-training run makes
 SHARED_WITH_SKILLS = ("num_skills", "skill_hidden_sizes", "skill_integration", "log_std_per_skill")
-WANDB_MODES = ("disabled",)  # the mirror is not built yet; a mode that does nothing would be a lie
+WANDB_MODES = ("disabled", "offline", "online")
 
 installed = functools.cache(version)  # reading a package's metadata takes 3 ms, and a plan asks a thousand times
 
@@ -86,6 +86,7 @@ class WandbConfig:
     """The mirror to Weights & Biases."""
 
     mode: str = "disabled"
+    project: str = "hippo"
 
 
 @dataclass
@@ -117,6 +118,7 @@ class Run:
     seed: int
     runs_dir: Path
     wandb_mode: str
+    wandb_project: str
     seconds_per_step: float
     kind: str = "train"  # or pretrain; evaluate and measure are about the trained run with the same settings
     evaluation: dict[str, Any] | None = None  # of kind evaluate: episodes, perturbations, strengths
@@ -385,6 +387,7 @@ def _validated(config: DictConfig, algo: str) -> Run:
         plain["seed"],
         Path(plain["runs_dir"]),
         plain["wandb"]["mode"],
+        plain["wandb"]["project"],
         env["seconds_per_step"],
         kind="pretrain" if algo in PRETRAINING.values() else "train",
     )

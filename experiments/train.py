@@ -31,6 +31,7 @@ from hippo import gradients
 from hippo.core import checkpoint, seeding
 from hippo.core.checkpoint import Checkpoint, CheckpointError
 from hippo.core.log import Diverged, Row, RunLog
+from hippo.core.mirror import mirrored
 from hippo.core.settings import ConfigError
 from hippo.envs import make
 
@@ -79,7 +80,7 @@ def _execute_locked(run: Run) -> str:
     except OSError as error:
         print(f"error: {run.run_id} cannot start: {error}", file=sys.stderr)
         return "failed"
-    with _preemption(), status.heartbeat():
+    with _preemption(), status.heartbeat(), mirrored(run.folder, run.wandb_mode, run.wandb_project):
         try:
             WORK[run.kind](run, status)
             status.update(state="finished", message="")

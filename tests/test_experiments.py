@@ -96,7 +96,7 @@ WRONG = [
     (["env.walls=true"], "env.walls=True"),
     (["algo.num_skills=2.5"], "algo.num_skills=2.5"),
     (["algo.skill_hidden_sizes=[64,a]"], "algo.skill_hidden_sizes"),
-    (["wandb.mode=online"], "wandb.mode=online: valid: disabled"),
+    (["wandb.mode=sometimes"], "wandb.mode=sometimes: valid: disabled, offline, online"),
     (["runs_dir="], "runs_dir="),
     (["foo"], "foo"),
     (["+new=1"], "+new=1"),

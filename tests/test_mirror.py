@@ -1,0 +1,113 @@
+"""The mirror to Weights & Biases: exactly progress.csv, through kills; it may hang or fail; it never sees the key."""
+
+import csv
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import psutil
+import pytest
+
+from experiments import train
+from experiments.config import compose_run
+from experiments.status import read_status
+from hippo.core import mirror
+from tests.wandb_log import history
+
+ROOT = Path(__file__).parent.parent
+TINY = ["env=block_hopper", "scale=smoke", "iterations=3", "batch_size=400"]
+CANARY = "c0ffee" * 6 + "c0ff"  # looks like a key: 40 hexadecimal digits
+
+
+def progress(folder):
+    with (folder / "progress.csv").open() as file:
+        return {int(row["iteration"]): {k: float(v) for k, v in row.items()} for row in csv.DictReader(file)}
+
+
+@pytest.fixture
+def no_account(monkeypatch, tmp_path):
+    """No key anywhere wandb looks for one."""
+    monkeypatch.setenv("HOME", str(tmp_path))
+    for name in [name for name in os.environ if name.startswith("WANDB")]:
+        monkeypatch.delenv(name)
+
+
+def test_after_kills_the_offline_logs_together_hold_exactly_the_rows_of_progress_csv(tmp_path, no_account):
+    arguments = ["env=block_hopper", "scale=smoke", "iterations=300", "batch_size=400", f"runs_dir={tmp_path}"]
+    command = [sys.executable, "-m", "experiments.train", *arguments, "wandb.mode=offline"]
+    run = compose_run(arguments)
+    for stop_at in (60, 120):
+        process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        while len(history(run.folder)) < stop_at:
+            assert process.poll() is None
+            time.sleep(0.05)
+        (child,) = [p for p in psutil.Process(process.pid).children() if "hippo.core.mirror" in p.cmdline()]
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        child.wait(20)  # ends by itself
+        mirrored = history(run.folder)
+        assert stop_at <= len(mirrored) < len(progress(run.folder)) < 300  # the last row may be dropped by a resume
+        assert mirrored.items() <= progress(run.folder).items()
+    assert subprocess.run(command, cwd=ROOT, capture_output=True, check=False).returncode == 0
+    assert read_status(run.folder)["state"] == "finished"
+    assert history(run.folder) == progress(run.folder)
+    assert len(list((run.folder / "wandb").glob("offline-run-*"))) == 3
+    assert {path.name for path in (run.folder / "wandb").glob("*/run-*.wandb")} == {f"run-{run.run_id}.wandb"}
+
+
+def test_the_key_is_in_no_file_and_no_output(tmp_path, monkeypatch, no_account):
+    monkeypatch.setenv("WANDB_API_KEY", CANARY)
+    command = [sys.executable, "-m", "experiments.train", *TINY, f"runs_dir={tmp_path / 'runs'}", "wandb.mode=offline"]
+    result = subprocess.run(command, cwd=ROOT, capture_output=True, check=True)
+    files = [path for path in tmp_path.rglob("*") if path.is_file()]
+    assert any(path.suffix == ".wandb" for path in files)
+    assert not [path for path in files if CANARY.encode() in path.read_bytes()]
+    assert CANARY.encode() not in result.stdout + result.stderr
+
+
+@pytest.mark.parametrize(
+    ("module", "word"),
+    [
+        ("import time; time.sleep(1000)", "did not finish within 1 s and was stopped"),
+        ("raise RuntimeError('broken')", "ended with exit code 1"),
+        ("import os, signal; os.kill(os.getpid(), signal.SIGKILL)", "ended with exit code -9"),
+    ],
+)
+def test_a_wandb_that_hangs_or_fails_never_stops_training(module, word, tmp_path, monkeypatch, capsys):
+    alone = compose_run([*TINY, f"runs_dir={tmp_path / 'alone'}"])
+    assert train.execute(alone) == "finished"
+    (tmp_path / "fake").mkdir()
+    (tmp_path / "fake/wandb.py").write_text(module)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path / "fake"))
+    monkeypatch.setattr(mirror, "WAIT_SECONDS", 1.0 if "sleep" in module else 30.0)
+    run = compose_run([*TINY, f"runs_dir={tmp_path / 'runs'}", "wandb.mode=offline"])
+    start = time.monotonic()
+    assert train.execute(run) == "finished"
+    assert time.monotonic() - start < 20
+    error = capsys.readouterr().err
+    assert f"warning: the wandb mirror {word}" in error
+    assert error.count("\n") == 1
+    for name in ("progress.csv", "checkpoint.pt"):
+        assert (run.folder / name).read_bytes() == (alone.folder / name).read_bytes()
+
+
+def test_online_without_a_key_asks_nothing_and_stops_nothing(tmp_path, capsys, no_account):
+    run = compose_run([*TINY, f"runs_dir={tmp_path / 'runs'}", "wandb.mode=online"])
+    assert train.execute(run) == "finished"
+    assert "warning: the wandb mirror ended with exit code 1" in capsys.readouterr().err
+    assert "wandb" in (run.folder / "wandb/mirror.log").read_text()
+
+
+def test_the_mirror_is_no_part_of_a_runs_identity():
+    assert compose_run([*TINY, "wandb.mode=offline", "wandb.project=x"]).run_id == compose_run(TINY).run_id
+
+
+def test_a_row_counts_as_covered_once_a_later_one_or_the_end_is_seen(tmp_path):
+    (tmp_path / "progress.csv").write_text("iteration,x\n0,1\n1,2\n2,")
+    for state, covered, ended in (("running", 1, False), ("preempted", 1, True), ("finished", 2, True)):
+        (tmp_path / "status.json").write_text(f'{{"state": "{state}"}}')
+        rows, over = mirror.covered_rows(tmp_path)
+        assert (len(rows), over) == (covered, ended)
