@@ -6,7 +6,8 @@
 progress.csv stays the truth. A row is mirrored once a checkpoint covers it, that is when a later row or the run's end
 has been seen, so wandb never holds a row that a resumed run drops. Every resume mirrors into the wandb run of the same
 id: online it goes on after the last row there, offline each session leaves a log of its own, whose union by step is
-progress.csv (`wandb sync --id`, in order of their start). The key comes from the environment or netrc, which only wandb reads.
+progress.csv (`wandb sync --id`, in order of their start). The key comes from the environment or netrc, which only
+wandb reads.
 """
 
 import contextlib
