@@ -10,7 +10,7 @@ SCALE ?= smoke
 LAUNCHER ?= local
 RUNS_DIR ?= runs
 BIN := .venv/bin
-RUN = $(BIN)/python -m
+PY = $(BIN)/python -m
 
 SWEEP_FLAGS = --scale $(SCALE) --launcher $(LAUNCHER) --runs-dir $(RUNS_DIR) $(if $(FRESH),--fresh) $(if $(YES),--yes)
 SWEEP_FLAGS += $(if $(filter slurm,$(LAUNCHER)),--wait) $(if $(PROFILE),--profile $(PROFILE))
@@ -29,16 +29,16 @@ install: .venv/installed  ## make .venv with the locked versions (nothing to do 
 	@touch $@
 
 $(FIGURES) $(TABLES): install
-	@if [ -f experiments/conf/figure/$@.yaml ]; then $(RUN) experiments.sweep run $@ $(SWEEP_FLAGS); fi
-	@$(RUN) paper_figures.$@ $(DRAW_FLAGS)
+	@if [ -f experiments/conf/figure/$@.yaml ]; then $(PY) experiments.sweep run $@ $(SWEEP_FLAGS); fi
+	@$(PY) paper_figures.$@ $(DRAW_FLAGS)
 
 all: $(FIGURES) $(TABLES)  ## every figure and table at SCALE
 
 report: install  ## one page with everything drawn at SCALE
-	@$(RUN) analysis.report $(DRAW_FLAGS)
+	@$(PY) analysis.report $(DRAW_FLAGS)
 
 plan-%: install
-	@$(RUN) experiments.sweep plan $* $(SWEEP_FLAGS)
+	@$(PY) experiments.sweep plan $* $(SWEEP_FLAGS)
 
 lint: install  ## ruff (format and rules) and mypy
 	$(BIN)/ruff format --check .
@@ -46,16 +46,23 @@ lint: install  ## ruff (format and rules) and mypy
 	$(BIN)/mypy
 
 test: install  ## every test but the slow ones
-	$(RUN) pytest -m "not slow and not slurm"
+	$(PY) pytest -m "not slow and not slurm"
 
 test-slurm: install  ## the launcher on a real one-node Slurm, installed by apt (as root) where it is missing
-	@$(RUN) tests.slurm.cluster install || echo "no Slurm here and none to be installed: its tests are skipped" >&2
-	$(RUN) pytest -m slurm tests/slurm
+	@$(PY) tests.slurm.cluster install || echo "no Slurm here and none to be installed: its tests are skipped" >&2
+	$(PY) pytest -m slurm tests/slurm
 
 smoke: fig3  ## train and draw Figure 3 at smoke scale
 
 bench: install  ## steps per second as ratios within one run, with a table
-	$(RUN) experiments.bench
+	$(PY) experiments.bench
+
+install-render:  ## what off-screen drawing needs, by apt (as root)
+	apt-get update -qq && apt-get install -y -qq --no-install-recommends libegl1 libgl1-mesa-dri
+
+video: install  ## a video of a trained policy: make video RUN=runs/<run_id>
+	@[ -n "$(RUN)" ] || { echo "error: RUN=: name a run folder, as in make video RUN=runs/<run_id>" >&2; exit 2; }
+	@$(PY) experiments.video $(RUN)
 
 clean:  ## remove what was installed and trained here (asks nothing)
 	rm -rf .venv runs paper_figures/out build *.egg-info
@@ -66,4 +73,4 @@ help:  ## this list
 	@echo "  make tableN      the same for: $(or $(TABLES),none yet)"
 	@echo "  make plan-figN   what it would train and cost, without training"
 
-.PHONY: install all report lint test test-slurm smoke bench clean help $(FIGURES) $(TABLES)
+.PHONY: install install-render all report lint test test-slurm smoke bench video clean help $(FIGURES) $(TABLES)

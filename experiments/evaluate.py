@@ -25,6 +25,7 @@ from hippo.core.checkpoint import Checkpoint, CheckpointError
 from hippo.core.episodes import opening_episodes
 from hippo.core.settings import ConfigError
 from hippo.envs import make
+from hippo.envs.vector import RobotTaskEnv
 
 COLUMNS = (
     "run_id",
@@ -41,6 +42,34 @@ COLUMNS = (
 )
 
 
+def load_run(folder: Path) -> Run:
+    """The run that lives in `folder`.
+
+    Raises:
+        ConfigError: it is no run folder.
+    """
+    if not (folder / "config.yaml").exists():
+        raise ConfigError("run", folder, "is no run folder: it has no config.yaml")
+    return Run.from_yaml((folder / "config.yaml").read_text(), folder.parent)
+
+
+def environments(run: Run, num_envs: int, seed: int, **changes: Any) -> RobotTaskEnv:
+    """The environments of `run`, for its evaluation; `changes` as in `evaluate`.
+
+    Raises:
+        ConfigError: there is nothing trained, or no such option.
+    """
+    if not (run.folder / "checkpoint.pt").exists():
+        raise ConfigError("run", run.folder, "has no checkpoint; train it first")
+    options = run.options | {name: value for name, value in changes.items() if value is not None}
+    try:
+        return make(run.env, num_envs, seeding.integer(seed, "evaluation"), horizon=run.config.horizon, **options)
+    except ValueError as error:
+        setting, _, valid = str(error).partition(": ")
+        key, _, value = setting.partition("=")
+        raise ConfigError(key, value, valid) from error
+
+
 def evaluate(run: Run, episodes: int, seed: int, greedy: bool = False, **changes: Any) -> list[dict[str, Any]]:
     """One row of COLUMNS per episode of the policy in `run`'s folder.
 
@@ -51,15 +80,7 @@ def evaluate(run: Run, episodes: int, seed: int, greedy: bool = False, **changes
     Raises:
         ConfigError: there is nothing trained, or no such option.
     """
-    if not (run.folder / "checkpoint.pt").exists():
-        raise ConfigError("run", run.folder, "has no checkpoint; train it first")
-    options = run.options | {name: value for name, value in changes.items() if value is not None}
-    try:
-        envs = make(run.env, episodes, seeding.integer(seed, "evaluation"), horizon=run.config.horizon, **options)
-    except ValueError as error:
-        setting, _, valid = str(error).partition(": ")
-        key, _, value = setting.partition("=")
-        raise ConfigError(key, value, valid) from error
+    envs = environments(run, episodes, seed, **changes)
     streams = seeding.integer(seed, "evaluation of a policy")
     steps = algorithm(run.algo).rollout(run.restored_config, envs, streams, Checkpoint(run.folder), greedy)
     returns, lengths = opening_episodes(steps.reward.numpy(), steps.done.numpy())
@@ -67,8 +88,8 @@ def evaluate(run: Run, episodes: int, seed: int, greedy: bool = False, **changes
         "run_id": run.run_id,
         "algo": run.algo,
         "env": run.env,
-        "perturbation": options.get("perturbation") or "none",
-        "strength": options.get("strength", "original"),
+        "perturbation": envs.options.perturbation or "none",
+        "strength": envs.options.strength,
         "greedy": greedy,
         "seed": seed,
         "diverged": steps.diverged,
@@ -112,9 +133,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
     try:
-        if not (options.run / "config.yaml").exists():
-            raise ConfigError("run", options.run, "is no run folder: it has no config.yaml")
-        run = Run.from_yaml((options.run / "config.yaml").read_text(), options.run.parent)
+        run = load_run(options.run)
         changes = {"perturbation": options.perturbation, "strength": options.strength}
         rows = evaluate(run, options.episodes, options.seed, options.greedy, **changes)
     except (ConfigError, CheckpointError) as error:

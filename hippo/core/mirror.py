@@ -67,7 +67,7 @@ def covered_rows(folder: Path) -> tuple[list[dict[str, str]], bool]:
     return rows if state in ("finished", "diverged") else rows[:-1], state != "running"
 
 
-def start(folder: Path, mode: str, project: str) -> Any:
+def start(folder: Path, mode: Any, project: str) -> Any:
     """The wandb run with this run's id; nothing of the machine, the code or the console is sent along."""
     import wandb
 

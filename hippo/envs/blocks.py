@@ -84,6 +84,8 @@ def observe(x: np.ndarray, ahead: np.ndarray, heights: np.ndarray, track: Track)
 class Blocks:
     """Walls of N simulations, and what clearing them pays."""
 
+    pays_for_speed = False
+
     def __init__(self, robot: Robot, options: Any, num_envs: int) -> None:
         self.robot, self.track, self.terminate_on_fall = robot, TRACKS[robot.name], options.terminate_on_fall
         self.heights = np.zeros((num_envs, NUM_HEIGHTS))  # (N, NUM_HEIGHTS) m

@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from hippo.envs.physics import BatchPhysics
-from hippo.envs.robots import Robot
+from hippo.envs.robots import POSITION, Robot
 
 NUM_APPLES = NUM_BOMBS = 8
 NUM_OBJECTS = NUM_APPLES + NUM_BOMBS
@@ -85,13 +85,21 @@ def lidar(com: np.ndarray, yaw: np.ndarray, objects: np.ndarray, present: np.nda
     return out.reshape(N, 2 * NUM_BINS)
 
 
+def dead(z: np.ndarray) -> np.ndarray:
+    """Whether an Ant at height z (N,) in m is: too low, too high or nowhere."""
+    return ~((z >= 0.3) & (z <= 1.0))
+
+
 class Gather:
     """Apples and bombs of N simulations, and what they pay."""
+
+    pays_for_speed = False
 
     def __init__(self, robot: Robot, options: Any, num_envs: int) -> None:
         self.robot, self.num_envs = robot, num_envs
         self.cells = cells(options.grid)
         self.penalty = PENALTIES[robot.name] if options.velocity_penalty else None
+        self.position = options.position
         self.has_walls = options.walls or robot.name == "ant"
         self.objects = np.zeros((num_envs, NUM_OBJECTS, 2))  # (N, O, 2) m
         self.present = np.zeros((num_envs, NUM_OBJECTS), bool)  # (N, O) not caught yet
@@ -127,7 +135,8 @@ class Gather:
     @property
     def entries(self) -> list[tuple[str, str, float, float]]:
         """Name, unit and bounds of the task's part of an observation."""
-        return [(f"{kind}_{i}", "1", 0.0, 1.0) for kind in ("apple", "bomb") for i in range(NUM_BINS)]
+        lidar = [(f"{kind}_{i}", "1", 0.0, 1.0) for kind in ("apple", "bomb") for i in range(NUM_BINS)]
+        return lidar + [(f"position_{axis}", "m", -POSITION, POSITION) for axis in "xy"] * self.position
 
     def reset(self, ids: np.ndarray, layouts: list[np.random.Generator]) -> None:
         """Place new objects in simulations `ids`."""
@@ -143,17 +152,21 @@ class Gather:
         terminated = np.asarray(~self.present.any(1))
         terms = {"reward_objects": reward}
         if self.robot.name == "ant":
-            z = self.physics.qpos[:, 2]
-            dead = ~((z >= 0.3) & (z <= 1.0))
-            terms["reward_objects"] = np.where(dead, 0.0, reward)
-            terms["reward_death"] = np.where(dead, DEATH_REWARD, 0.0)
-            terminated = terminated | dead
+            is_dead = dead(self.physics.qpos[:, 2])
+            terms["reward_objects"] = np.where(is_dead, 0.0, reward)
+            terms["reward_death"] = np.where(is_dead, DEATH_REWARD, 0.0)
+            terminated = terminated | is_dead
         if self.penalty is not None:
             assert self.com_velocity is not None
             terms["velocity_penalty"] = self.penalty(np.linalg.norm(self.com_velocity, axis=1))
         return _total(terms), terminated, terms
 
     def observe(self) -> np.ndarray:
+        """(N, 20) lidar readings, then with `position` the torso's x and y."""
+        readings = self.readings()
+        return np.concatenate([readings, self.physics.qpos[:, :2]], 1) if self.position else readings
+
+    def readings(self) -> np.ndarray:
         """(N, 20) lidar readings."""
         assert self.robot.yaw is not None
         return lidar(self.com[:, :2], self.robot.yaw(self.physics.qpos), self.objects, self.present)

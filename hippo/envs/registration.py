@@ -1,11 +1,16 @@
 """The environments by name: robot, task, horizon, and which options each of them has."""
 
 import dataclasses
+import functools
 from dataclasses import dataclass
 from typing import Any
 
+import gymnasium as gym
+import numpy as np
+
 from hippo.envs.blocks import Blocks
 from hippo.envs.gather import Gather
+from hippo.envs.locomote import Locomotion
 from hippo.envs.perturb import PERTURBATIONS, STRENGTHS
 from hippo.envs.robots import ROBOTS
 from hippo.envs.vector import RobotTaskEnv
@@ -22,6 +27,7 @@ class Options:
     velocity_penalty: bool = False  # Gather: penalise the centre of mass's speed, for Fig. 6
     grid: str = "original"  # Gather: "symmetric" (ours) also places objects at +6 m
     walls: bool = False  # Snake Gather (ours): the arena's walls hold the Snake; they always hold the Ant
+    position: bool = False  # Gather: append the torso's absolute x, y to the observation, for HIRO (Fig. 7)
     terminate_on_fall: bool = False  # Block: rllab's conditions; the paper names none
 
 
@@ -38,7 +44,13 @@ class Environment:
 
 _SHARED = {"perturbation": (None, *PERTURBATIONS), "strength": STRENGTHS}
 _SWITCH = (False, True)
-_GATHER = _SHARED | {"velocity_penalty": _SWITCH, "grid": ("original", "symmetric"), "physics": ("paper", "fast")}
+_ALONE = _SHARED  # the robots without a task, for the pre-training of skills
+_GATHER = _SHARED | {
+    "velocity_penalty": _SWITCH,
+    "position": _SWITCH,
+    "grid": ("original", "symmetric"),
+    "physics": ("paper", "fast"),
+}
 _BLOCK = _SHARED | {"terminate_on_fall": _SWITCH, "physics": ("paper",), "observation": ("paper",)}
 
 ENVIRONMENTS = {
@@ -48,18 +60,33 @@ ENVIRONMENTS = {
     ),
     "block_hopper": Environment("hopper", Blocks, 1000, 1, _BLOCK),
     "block_half_cheetah": Environment("half_cheetah", Blocks, 1000, 1, _BLOCK),
+    "ant": Environment("ant", Locomotion, 400, 1, _ALONE | {"observation": ("paper",), "physics": ("paper", "fast")}),
+    "snake": Environment(
+        "snake", Locomotion, 400, 1, _ALONE | {"observation": ("paper", "ego"), "physics": ("paper", "fast")}
+    ),
+    "hopper": Environment("hopper", Locomotion, 1000, 1, _ALONE | {"observation": ("paper",), "physics": ("paper",)}),
+    "half_cheetah": Environment(
+        "half_cheetah", Locomotion, 1000, 1, _ALONE | {"observation": ("paper",), "physics": ("paper",)}
+    ),
 }
 
 
 def make(
-    name: str, num_envs: int, seed: int, num_threads: int = 1, horizon: int | None = None, **options: Any
+    name: str,
+    num_envs: int,
+    seed: int,
+    num_threads: int = 1,
+    horizon: int | None = None,
+    autoreset: bool = True,
+    **options: Any,
 ) -> RobotTaskEnv:
     """Build a vector environment.
 
     Args:
         name: a key of ENVIRONMENTS. num_envs: simulations. seed: environment i draws from `seed + i`.
         num_threads: that MuJoCo steps on; results do not depend on it.
-        horizon: steps to truncation instead of the environment's own. options: fields of Options.
+        horizon: steps to truncation instead of the environment's own. autoreset: whether ended episodes are followed
+        by new ones in the same step. options: fields of Options.
 
     Raises:
         ValueError: a name, option or value that does not exist; the message names it and the valid ones.
@@ -82,7 +109,46 @@ def make(
         horizon,
         environment.revision,
         num_threads,
+        autoreset,
     )
+
+
+def gymnasium_id(name: str) -> str:
+    """The id for `gymnasium.make`, e.g. hippo/AntGather-v0; its version counts revisions of the golden trajectories."""
+    return f"hippo/{name.title().replace('_', '')}-v{ENVIRONMENTS[name].revision - 1}"
+
+
+def make_single(name: str, render_mode: str | None = None, **options: Any) -> Any:
+    """The environment as a gymnasium.Env; arguments as `make`. Unseeded resets start from the machine's entropy."""
+    from hippo.envs.single import SingleEnv
+
+    return SingleEnv(make(name, 1, entropy(), autoreset=False, **options), render_mode)
+
+
+def make_several(name: str, num_envs: int = 1, render_mode: str | None = None, **options: Any) -> RobotTaskEnv:
+    """The environment as a gymnasium.vector.VectorEnv, for `gymnasium.make_vec`; arguments as `make`.
+
+    Raises:
+        ValueError: a render mode; a single environment renders.
+    """
+    if render_mode is not None:
+        raise ValueError(f"render_mode={render_mode}: a vector environment has none; use gymnasium.make")
+    return make(name, num_envs, entropy(), **options)
+
+
+def entropy() -> int:
+    """A fresh seed."""
+    return int(np.random.SeedSequence().generate_state(1)[0])
+
+
+def register() -> None:
+    """Make every environment known to Gymnasium."""
+    for name in ENVIRONMENTS:
+        gym.register(
+            gymnasium_id(name),
+            entry_point=functools.partial(make_single, name),
+            vector_entry_point=functools.partial(make_several, name),
+        )
 
 
 def check_option(name: str, key: str, value: Any) -> None:

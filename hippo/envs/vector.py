@@ -12,6 +12,7 @@ from hippo.envs.perturb import perturb
 from hippo.envs.physics import BatchPhysics
 from hippo.envs.robots import Robot
 
+RENDER_MODES = ("rgb_array", "human")
 POSE_NOISE, VELOCITY_NOISE = 0.01, 0.1  # std of the initial qpos and qvel around the model's (rllab)
 RNG_WORDS = 6  # uint64 words that hold one PCG64 generator
 
@@ -24,10 +25,10 @@ class RobotTaskEnv(gym.vector.VectorEnv):
     horizon or a diverged simulation (`info["diverged"]`: reward 0, `final_obs` its last finite observation). The
     reward's terms are in `info` under their names.
 
+    Without `autoreset` an environment whose episode ended stays as it is until `reset`, and `info` has no final_*.
+
     Environment i draws from its own generator, seeded with `seed + i`, so it does not depend on its neighbours.
     """
-
-    metadata = {"render_modes": [], "autoreset_mode": gym.vector.AutoresetMode.SAME_STEP}  # noqa: RUF012
 
     def __init__(
         self,
@@ -39,6 +40,7 @@ class RobotTaskEnv(gym.vector.VectorEnv):
         horizon: int,
         revision: int,
         num_threads: int = 1,
+        autoreset: bool = True,
     ) -> None:
         self.num_envs, self.horizon, self.revision, self.options = num_envs, horizon, revision, options
         self.robot, self.task = robot, task_class(robot, options, num_envs)
@@ -48,7 +50,11 @@ class RobotTaskEnv(gym.vector.VectorEnv):
             perturb(spec, robot.name, options.perturbation, options.strength)
         model = spec.compile()
         timing, centre = robot.timing(options.physics), None
-        if robot.com_features is not None and timing.integrator == mujoco.mjtIntegrator.mjINT_RK4 and not model.nsensor:
+        mode = gym.vector.AutoresetMode.SAME_STEP if autoreset else gym.vector.AutoresetMode.DISABLED
+        fps = round(1 / (timing.timestep * timing.frame_skip))
+        self.metadata = {"render_modes": list(RENDER_MODES), "render_fps": fps, "autoreset_mode": mode}
+        slow = timing.integrator == mujoco.mjtIntegrator.mjINT_RK4 and not model.nsensor
+        if robot.com_features is not None and slow and not self.task.pays_for_speed:
             centre = MassCentre(model, robot.com_features, is_free=model.jnt_type[0] == mujoco.mjtJoint.mjJNT_FREE)
         self.physics = BatchPhysics(model, num_envs, timing.frame_skip, num_threads, centre)
         self.task.attach(self.physics)
@@ -73,9 +79,25 @@ class RobotTaskEnv(gym.vector.VectorEnv):
         self._qpos = model.key_qpos[0].copy() if model.nkey else model.qpos0.copy()
         self._clock = np.zeros(num_envs, np.int64)
         self._obs = np.zeros((num_envs, len(entries)), np.float32)
+        self.autoreset = autoreset
         self._layout_seed: int | None = None
         self._started = False
         self._seed(seed)
+
+    @property
+    def robot_name(self) -> str:
+        """ant, snake, hopper or half_cheetah."""
+        return self.robot.name
+
+    @property
+    def observation_variant(self) -> str:
+        """Which of the robot's observations this is, "paper" or "ego"."""
+        return self.options.observation
+
+    @property
+    def com(self) -> np.ndarray:
+        """(N, 3) m, whole-robot centres of mass now; after a step, `info["com"]` has those before any autoreset."""
+        return self.physics.com
 
     def _seed(self, seed: int | Sequence[int | None]) -> None:
         if isinstance(seed, Sequence):
@@ -138,12 +160,13 @@ class RobotTaskEnv(gym.vector.VectorEnv):
             reward, terminated = np.where(diverged, 0.0, reward), terminated & ~diverged
             info = {name: np.where(diverged, 0.0, term) for name, term in info.items()}
         truncated = ((self._clock >= self.horizon) & ~terminated) | diverged
-        info["diverged"] = diverged
+        info |= {"diverged": diverged, "com": self.com.copy()}
 
         obs = self._observe()
         done = terminated | truncated
         if done.any():
             obs[diverged] = self._obs[diverged]
+        if done.any() and self.autoreset:
             info |= {
                 "final_obs": obs.copy(),
                 "_final_obs": done,

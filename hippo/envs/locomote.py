@@ -1,0 +1,71 @@
+"""Locomotion of the robots alone, for the pre-training of skills: no walls, no objects.
+
+Ant and Snake are paid for the speed of their centre of mass less a control cost, as the inner robots of the authors'
+Gather tasks (the Ant's contact cost is left out: current MuJoCo reports no contact forces there). Hopper and
+Half-Cheetah are paid nothing: DIAYN brings its own reward.
+"""
+
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from hippo.envs.gather import dead
+from hippo.envs.physics import BatchPhysics
+from hippo.envs.robots import Robot
+
+CONTROL_COST = 0.5 * 0.01  # per squared action, the actions being in [-1, 1]
+SURVIVAL = {"ant": 0.05, "snake": 0.0}  # per step; robots that are not here are paid nothing at all
+
+
+class Locomotion:
+    """The centres of mass of N simulations, and what moving them pays."""
+
+    # A difference of centres of mass would show in which order MassCentre adds up, and that depends on N.
+    pays_for_speed = True
+
+    def __init__(self, robot: Robot, options: Any, num_envs: int) -> None:
+        self.robot, self.timing = robot, robot.timing(options.physics)
+        self.before = np.zeros((num_envs, 3))  # (N, 3) m, centre of mass at the last step
+
+    def build(self, spec: mujoco.MjSpec) -> None:
+        """Nothing is added to the robot and its floor."""
+
+    def attach(self, physics: BatchPhysics) -> None:
+        """Take views of what the task reads from the simulations."""
+        self.physics, self.com = physics, physics.com
+        self.largest_control = physics.model.actuator_ctrlrange[:, 1]
+
+    @property
+    def entries(self) -> list[tuple[str, str, float, float]]:
+        """The task adds nothing to what the robot observes of itself."""
+        return []
+
+    def reset(self, ids: np.ndarray, layouts: list[np.random.Generator]) -> None:
+        """Start at rest in simulations `ids`."""
+        self.before[ids] = self.com[ids]
+
+    def step(self) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+        """Reward (N,), terminated (N,) and the reward's terms, read from the new state."""
+        N = len(self.com)
+        moved = np.linalg.norm((self.com - self.before)[:, :2], axis=1)
+        self.before[:] = self.com
+        if self.robot.name not in SURVIVAL:
+            return np.zeros(N), np.zeros(N, bool), {}
+        action = self.physics.ctrl / self.largest_control
+        terms = {
+            "reward_speed": moved / (self.timing.timestep * self.timing.frame_skip),
+            "reward_control": -CONTROL_COST * (action * action).sum(1),
+            "reward_survival": np.full(N, SURVIVAL[self.robot.name]),
+        }
+        terminated = dead(self.physics.qpos[:, 2]) if self.robot.name == "ant" else np.zeros(N, bool)
+        return np.sum(list(terms.values()), 0), terminated, terms
+
+    def observe(self) -> np.ndarray:
+        """(N, 0)."""
+        return np.zeros((len(self.com), 0))
+
+    @property
+    def state(self) -> dict[str, np.ndarray]:
+        """The arrays that a continuation needs."""
+        return {"before": self.before}

@@ -1,0 +1,186 @@
+"""Pictures of a simulation: the robot, and drawn over it what the task knows - apples, bombs and lidar readings.
+
+    renderer = Renderer(envs)          # a RobotTaskEnv; needs EGL or OSMesa (`make install-render`)
+    image = renderer.frame(i)          # (H, W, 3) uint8 of simulation i as it is now
+    renderer.close()
+
+Nothing is added to the simulated model: what is drawn for the viewer's sake lives in MuJoCo's scene only.
+"""
+
+import copy
+import importlib
+import os
+from typing import Any, Protocol
+
+import mujoco
+import numpy as np
+
+from hippo.envs.gather import NUM_APPLES, NUM_BINS, SENSOR_RANGE, Gather
+
+APPLE, BOMB = np.array([0.25, 0.75, 0.25, 1.0], np.float32), np.array([0.85, 0.15, 0.15, 1.0], np.float32)
+OBJECT_RADIUS = 0.35  # m; they are caught from 1 m away
+WALL, WALL_HALF_WIDTH = np.array([0.25, 0.42, 0.68, 1.0]), 0.8  # m; the real ones cross the whole track
+RAY_RADIUS = 0.035  # m
+SKY = (250, 250, 252)  # where nothing is
+
+
+class Scene(Protocol):
+    """What of a RobotTaskEnv is drawn."""
+
+    physics: Any
+    task: Any
+    robot: Any
+
+
+class NoOpenGL(RuntimeError):
+    """There is nothing here that can draw; the message says what to install."""
+
+
+def open_gl() -> str:
+    """The name of the first OpenGL back end that works without a display: egl or osmesa.
+
+    Raises:
+        NoOpenGL: neither does.
+    """
+    wanted = os.environ.get("MUJOCO_GL")
+    for name in [wanted] if wanted else ["egl", "osmesa"]:
+        try:
+            context = importlib.import_module(f"mujoco.{name}").GLContext(64, 64)
+        except (ImportError, AttributeError, RuntimeError, OSError):
+            continue
+        context.free()
+        return str(name)
+    raise NoOpenGL(f"no OpenGL to draw with (MUJOCO_GL={wanted or 'egl, then osmesa'}): run `make install-render`")
+
+
+class Renderer:
+    """Frames of one simulation at a time, off screen."""
+
+    def __init__(self, envs: Scene, width: int = 640, height: int = 480) -> None:
+        self.envs, self._model = envs, lit(envs.physics.model)
+        model = self._model
+        back_end = open_gl()
+        self._context = importlib.import_module(f"mujoco.{back_end}").GLContext(width, height)
+        self._context.make_current()
+        model.vis.global_.offwidth, model.vis.global_.offheight = width, height
+        self._scene = mujoco.MjvScene(model, maxgeom=1000)
+        self._mujoco = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._mujoco)
+        self._option, self._rectangle = mujoco.MjvOption(), mujoco.MjrRect(0, 0, width, height)
+        self.camera = mujoco.MjvCamera()
+        aim(self.camera, envs)
+
+    def frame(self, env: int) -> np.ndarray:
+        """(H, W, 3) uint8 picture of simulation `env`."""
+        data, model = self.envs.physics.data(env), self._model
+        mujoco.mj_forward(model, data)
+        follow(self.camera, self.envs, env)
+        self._context.make_current()
+        every = mujoco.mjtCatBit.mjCAT_ALL
+        mujoco.mjv_updateScene(model, data, self._option, None, self.camera, every, self._scene)
+        draw_task(self._scene, self.envs, env)
+        mujoco.mjr_render(self._rectangle, self._scene, self._mujoco)
+        image = np.empty((self._rectangle.height, self._rectangle.width, 3), np.uint8)
+        depth = np.empty(image.shape[:2], np.float32)
+        mujoco.mjr_readPixels(image, depth, self._rectangle, self._mujoco)
+        image[depth == 1] = SKY
+        return image[::-1].copy()
+
+    def close(self) -> None:
+        """Release the graphics memory."""
+        self._context.make_current()
+        self._mujoco.free()
+        self._context.free()
+
+
+class Viewer:
+    """A window that shows one simulation, where there is a display.
+
+    Raises:
+        NoOpenGL: there is no display.
+    """
+
+    def __init__(self, envs: Scene) -> None:
+        if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+            raise NoOpenGL("render_mode=human needs a display; use rgb_array, or `make video RUN=...`")
+        from mujoco import viewer
+
+        self.envs, self._data = envs, mujoco.MjData(envs.physics.model)
+        self._window = viewer.launch_passive(envs.physics.model, self._data, show_left_ui=False, show_right_ui=False)
+        aim(self._window.cam, envs)
+
+    def show(self, env: int) -> None:
+        """Bring the window up to date with simulation `env`."""
+        with self._window.lock():
+            data = self.envs.physics.data(env)
+            self._data.qpos[:], self._data.mocap_pos[:] = data.qpos, data.mocap_pos
+            mujoco.mj_forward(self.envs.physics.model, self._data)
+            follow(self._window.cam, self.envs, env)
+            self._window.user_scn.ngeom = 0
+            draw_task(self._window.user_scn, self.envs, env)
+        self._window.sync()
+
+    def close(self) -> None:
+        """Close the window."""
+        self._window.close()
+
+
+def lit(model: mujoco.MjModel) -> mujoco.MjModel:
+    """A copy for the eye: bright, with a floor that reaches the horizon and walls that do not hide what is behind."""
+    bright = copy.deepcopy(model)
+    bright.vis.headlight.ambient[:], bright.vis.headlight.diffuse[:] = 0.55, 0.45
+    bright.geom("floor").size[:2] = 0  # drawn without end
+    for i in range(bright.ngeom):
+        if bright.geom(i).name.startswith("block_"):
+            bright.geom(i).size[1], bright.geom(i).rgba[:] = WALL_HALF_WIDTH, WALL
+    return bright
+
+
+def aim(camera: mujoco.MjvCamera, envs: Scene) -> None:
+    """From above where the task is in the plane, from the side along a track."""
+    camera.type = mujoco.mjtCamera.mjCAMERA_FREE
+    if isinstance(envs.task, Gather):
+        camera.distance, camera.elevation, camera.azimuth = 22.0, -55.0, 90.0
+    elif envs.robot.yaw is not None:
+        camera.distance, camera.elevation, camera.azimuth = 6.0, -30.0, 90.0
+    else:
+        camera.distance, camera.elevation, camera.azimuth = 5.0, -16.0, 80.0
+
+
+def follow(camera: mujoco.MjvCamera, envs: Scene, env: int) -> None:
+    """Look at the robot; in the arena, at its middle, so that all of it stays in view."""
+    com = envs.physics.com[env]
+    camera.lookat[:] = (0.0, 0.0, 0.0) if isinstance(envs.task, Gather) else (com[0], com[1], 0.5)
+
+
+def draw_task(scene: mujoco.MjvScene, envs: Scene, env: int) -> None:
+    """Add to `scene` the objects that are left and, as thin rays, the lidar readings."""
+    task = envs.task
+    if not isinstance(task, Gather):
+        return
+    for k in np.flatnonzero(task.present[env]):
+        x, y = task.objects[env, k]
+        _add_object(scene, np.array([x, y, OBJECT_RADIUS]), is_apple=bool(k < NUM_APPLES))
+    x, y = envs.physics.com[env, :2]
+    yaw = float(envs.robot.yaw(envs.physics.qpos[env : env + 1])[0])
+    readings = task.readings()[env]
+    for k in np.flatnonzero(readings):
+        angle = yaw - np.pi + (k % NUM_BINS + 0.5) * 2 * np.pi / NUM_BINS
+        reach = (1 - readings[k]) * SENSOR_RANGE
+        start, end = np.array([x, y, 0.3]), np.array([x + reach * np.cos(angle), y + reach * np.sin(angle), 0.3])
+        _add_ray(scene, start, end, APPLE if k < NUM_BINS else BOMB)
+
+
+def _add_object(scene: mujoco.MjvScene, centre: np.ndarray, is_apple: bool) -> None:
+    """An apple is a green ball, a bomb a red cube."""
+    kind, colour = (mujoco.mjtGeom.mjGEOM_SPHERE, APPLE) if is_apple else (mujoco.mjtGeom.mjGEOM_BOX, BOMB)
+    size = np.full(3, OBJECT_RADIUS if is_apple else 0.8 * OBJECT_RADIUS)
+    mujoco.mjv_initGeom(scene.geoms[scene.ngeom], kind, size, centre, np.eye(3).ravel(), colour)
+    scene.ngeom += 1
+
+
+def _add_ray(scene: mujoco.MjvScene, start: np.ndarray, end: np.ndarray, colour: np.ndarray) -> None:
+    geom, kind = scene.geoms[scene.ngeom], mujoco.mjtGeom.mjGEOM_CAPSULE
+    mujoco.mjv_initGeom(geom, kind, np.zeros(3), np.zeros(3), np.zeros(9), colour)
+    mujoco.mjv_connector(geom, kind, RAY_RADIUS, start, end)
+    scene.ngeom += 1
