@@ -144,7 +144,7 @@ def aim(camera: mujoco.MjvCamera, envs: Scene) -> None:
     elif envs.robot.yaw is not None:
         camera.distance, camera.elevation, camera.azimuth = 6.0, -30.0, 90.0
     else:
-        camera.distance, camera.elevation, camera.azimuth = 5.0, -16.0, 80.0
+        camera.distance, camera.elevation, camera.azimuth = 4.2, -16.0, 80.0
 
 
 def follow(camera: mujoco.MjvCamera, envs: Scene, env: int) -> None:

@@ -1,0 +1,102 @@
+"""Figure 1: the temporal hierarchy - a manager that commits to a skill every p steps, a skill that acts in between."""
+
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+import matplotlib.pyplot as plt
+from matplotlib.axes import Axes
+from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
+
+from paper_figures import style
+from paper_figures.command_line import parse
+
+TITLE = "The temporal hierarchy"
+CAPTION = (
+    "A latent code z is sampled from the manager policy every p steps from the current observation; the actions are "
+    "sampled from the sub-policy conditioned on the same code until the next decision. Drawn by code after Figure 1 of "
+    "the paper."
+)
+MANAGER, SKILL, STATE = "#0072B2", "#D55E00", "#F2F2F2"
+TOP, MIDDLE, BOTTOM = 3.0, 1.5, 0.0  # rows: manager, skill, environment
+COLUMNS = (0.0, 1.7, 4.3, 6.5, 8.2)  # s_kp, s_kp+1, the end of the commitment, the next decision, after it
+DOTS = 3.0
+
+
+def box(axes: Axes, x: float, y: float, text: str, face: str, ink: str = "white") -> None:
+    """A rounded box around `text`."""
+    patch = FancyBboxPatch(
+        (x - 0.6, y - 0.3), 1.2, 0.6, "round,pad=0.02,rounding_size=0.12", fc=face, ec="#555555", lw=0.8
+    )
+    axes.add_patch(patch)
+    axes.text(x, y, text, ha="center", va="center", color=ink, fontsize=8)
+
+
+def arrow(axes: Axes, start: tuple[float, float], end: tuple[float, float], **how: Any) -> None:
+    """An arrow between two points."""
+    look: dict[str, Any] = {
+        "arrowstyle": "-|>",
+        "mutation_scale": 9,
+        "color": "#333333",
+        "lw": 1.0,
+        "shrinkA": 0,
+        "shrinkB": 0,
+    } | how
+    axes.add_patch(FancyArrowPatch(start, end, **look))
+
+
+def draw(axes: Axes) -> None:
+    """One commitment of p steps and the beginning of the next."""
+    states = ["$s_{kp}$", "$s_{kp+1}$", "$s_{(k+1)p-1}$", "$s_{(k+1)p}$", "$s_{(k+1)p+1}$"]
+    actions = ["$a_{kp}$", "$a_{kp+1}$", "$a_{(k+1)p-1}$", "$a_{(k+1)p}$", ""]
+    for i, (x, state, action) in enumerate(zip(COLUMNS, states, actions, strict=True)):
+        box(axes, x, BOTTOM, state, STATE, "black")
+        if not action:
+            continue
+        box(axes, x, MIDDLE, r"$\pi_{\theta_l}(a|s,z)$", SKILL)
+        arrow(axes, (x - 0.3, BOTTOM + 0.33), (x - 0.3, MIDDLE - 0.33))
+        arrow(axes, (x + 0.3, MIDDLE - 0.33), (x + 0.3, BOTTOM + 0.33))
+        axes.text(x + 0.36, (MIDDLE + BOTTOM) / 2, action, va="center", fontsize=8)
+        if i != 2:  # between the second column and the third steps are left out
+            following = COLUMNS[i + 1] - 0.63 if i != 1 else DOTS - 0.25
+            arrow(axes, (x + 0.63, BOTTOM), (following, BOTTOM))
+        else:
+            arrow(axes, (x + 0.63, BOTTOM), (COLUMNS[3] - 0.63, BOTTOM))
+    for y in (BOTTOM, MIDDLE):
+        axes.text(DOTS, y, r"$\cdots$", ha="center", va="center", fontsize=12)
+    arrow(axes, (DOTS + 0.25, BOTTOM), (COLUMNS[2] - 0.63, BOTTOM))
+
+    for x, z, end in ((COLUMNS[0], "$z_{kp}$", COLUMNS[2]), (COLUMNS[3], "$z_{(k+1)p}$", COLUMNS[4])):
+        box(axes, x, TOP, r"$\pi_{\theta_h}(z|s)$", MANAGER)
+        arrow(axes, (x - 0.5, BOTTOM + 0.33), (x - 0.5, TOP - 0.33), connectionstyle="arc3,rad=-0.28")
+        rail = (TOP + MIDDLE) / 2 + 0.1
+        axes.plot([x, x], [TOP - 0.33, rail], color=MANAGER, lw=1.4)
+        axes.plot([x, end], [rail, rail], color=MANAGER, lw=1.4, ls="-" if end == COLUMNS[2] else (0, (4, 2)))
+        axes.text(x + 0.12, rail + 0.2, z, fontsize=8, color=MANAGER)
+    rail = (TOP + MIDDLE) / 2 + 0.1
+    for x in COLUMNS[:4]:
+        arrow(axes, (x, rail), (x, MIDDLE + 0.33), color=MANAGER)
+    arrow(axes, (COLUMNS[0] - 0.6, -0.72), (COLUMNS[2] + 0.6, -0.72), arrowstyle="<->")
+    axes.text((COLUMNS[0] + COLUMNS[2]) / 2, -0.98, "time commitment: p steps", ha="center", va="center", fontsize=8)
+    axes.set_xlim(-1.1, COLUMNS[-1] + 0.8)
+    axes.set_ylim(-1.2, TOP + 0.5)
+    axes.set_aspect("equal")
+    axes.axis("off")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Draw it; there is no data behind it, so every scale gives the same figure."""
+    options = parse("fig1", arguments)
+    style.use()
+    figure, axes = plt.subplots(figsize=(style.WIDTH, 3.4), layout="constrained")
+    draw(axes)
+    stem = options.out / options.scale / "fig1"
+    written = style.save(figure, stem, TITLE, "no data: a diagram")
+    caption = stem.with_suffix(".caption.txt")
+    caption.write_text(f"{TITLE}. {CAPTION}\n")
+    print("wrote", *written, caption)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
