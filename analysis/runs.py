@@ -54,6 +54,8 @@ def load(
     plan = json.loads(path.read_text())
     if plan["scale"] != scale:
         raise ValueError(f"{path}: is a plan of scale {plan['scale']}, not of {scale}")
+    if not plan["runs"]:
+        raise MissingData(f"{figure}: nothing is trained at scale {scale}; choose another")
     physics = pd.DataFrame(plan["runs"]).groupby("env")["physics"].nunique()
     if (physics > 1).any():
         raise ValueError(f"{figure}: {physics.idxmax()} mixes two kinds of physics")

@@ -24,6 +24,7 @@ from hippo.core.hierarchy import HierarchicalPolicy, HierarchyConfig, collect, l
 from hippo.core.log import RunLog, check_finite
 from hippo.core.ppo import Level, chunks
 from hippo.core.settings import setting
+from hippo.core.skills import start_from
 
 __all__ = ["HierVPGConfig", "rollout", "train"]
 
@@ -64,6 +65,7 @@ def train(config: HierVPGConfig, make_envs: MakeEnvs, log: RunLog, seed: int, ch
     obs_size, action_size = envs.single_observation_space.shape[0], envs.single_action_space.shape[0]
     generator = seeding.torch_generator(seed, "initialisation")
     policy = HierarchicalPolicy(config, obs_size, envs.robot_size, action_size, generator)
+    start_from(config.skills, policy.skills, envs)
     baselines = Baselines(config, obs_size, generator)
     optimizer = torch.optim.Adam(policy.parameters(), lr=config.learning_rate)
 

@@ -34,6 +34,7 @@ from hippo.core.minibatch import maximize_in_minibatches
 from hippo.core.policies import Manager
 from hippo.core.ppo import Level
 from hippo.core.settings import ConfigError, setting
+from hippo.core.skills import start_from
 from hippo.core.value import ValueFunction, explained_variance
 
 __all__ = ["MLSHConfig", "rollout", "train"]
@@ -228,11 +229,13 @@ def train(config: MLSHConfig, make_envs: MakeEnvs, log: RunLog, seed: int, check
 
     Raises:
         Diverged: an observation, a reward or a parameter is no longer finite.
+        SkillsError: the given skills cannot be read or do not fit.
     """
     envs = make_envs(config.num_envs, "training")
     obs_size, action_size = envs.single_observation_space.shape[0], envs.single_action_space.shape[0]
     generator = seeding.torch_generator(seed, "initialisation")
     policy = MLSHPolicy(config, obs_size, envs.robot_size, action_size, generator)
+    start_from(config.skills, policy.skills, envs)
     baselines = Baselines(config, obs_size, generator)
     optimizers: dict[str, torch.optim.Optimizer] = {
         "manager": torch.optim.Adam(policy.manager.parameters(), lr=config.manager_learning_rate, fused=True),

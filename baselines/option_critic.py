@@ -26,6 +26,7 @@ from hippo.core.policies import gaussian_entropy
 from hippo.core.ppo import Level, clipped_surrogate, in_chunks, surrogate_statistics
 from hippo.core.rollout import Steps
 from hippo.core.settings import ConfigError, check, setting
+from hippo.core.skills import start_from
 from hippo.core.value import explained_variance
 
 __all__ = ["OptionCriticConfig", "rollout", "train"]
@@ -115,6 +116,11 @@ class OptionCriticConfig:
         "one log-std vector per option instead of a shared one",
         code="per option",
         ours="shared: as in the skills that all methods are given",
+    )
+    skills: str = setting(
+        "",
+        "skills file that the intra-option policies start from; empty: from scratch",
+        paper="from scratch; given skills in Fig. 6",
     )
     manager_hidden_sizes: list[int] = setting(
         [32, 32], "hidden layers of the policy over options", paper="2 x 32 (manager, App. A)", low=1
@@ -474,9 +480,11 @@ def train(config: OptionCriticConfig, make_envs: MakeEnvs, log: RunLog, seed: in
 
     Raises:
         Diverged: an observation, a reward or a parameter is no longer finite.
+        SkillsError: the given skills cannot be read or do not fit.
     """
     envs = make_envs(config.num_envs, "training")
     policy = make_policy(config, envs, seeding.torch_generator(seed, "initialisation"))
+    start_from(config.skills, policy.skills, envs)
     optimizers = make_optimizers(config, policy)
     parts = {"policy": policy, **{f"{name}_optimizer": optimizer for name, optimizer in optimizers.items()}}
     first = checkpoint.restore(**parts)
@@ -495,7 +503,7 @@ def train(config: OptionCriticConfig, make_envs: MakeEnvs, log: RunLog, seed: in
             data = portion(config, policy, steps, run.options, begin, end)
             updates.append(update(config, policy, optimizers, data, generator))
             check_finite(iteration, parameters=nn.utils.parameters_to_vector(policy.parameters()))
-            if config.observation_filter:
+            if config.observation_filter and not config.skills:
                 policy.filter.update(steps.obs[begin:end])
             update_seconds += time.perf_counter() - collected
         finished = time.perf_counter()

@@ -2,7 +2,8 @@
 
     python -m experiments.bench [--quick]
 
-Absolute numbers depend on the machine and on what else it does; ratios within one run hardly do. One thread throughout.
+Absolute numbers depend on the machine and on what else it does; ratios within one run hardly do. One thread unless the
+row says otherwise.
 """
 
 import argparse
@@ -11,72 +12,26 @@ import statistics
 import subprocess
 import sys
 import tempfile
-import time
-from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import torch
-from mujoco.batch import Batch
 
+from experiments import bench_environments, bench_peers, bench_scaling, bench_sweeps
+from experiments.bench_environments import physics_and_environment
 from experiments.config import Run, algorithm, compose_run
 from hippo.core.checkpoint import Checkpoint
 from hippo.core.log import RunLog
-from hippo.envs import ENVIRONMENTS, make
-from hippo.envs.gather import lidar
+from hippo.envs import make
 from hippo.envs.vector import RobotTaskEnv
 
 NUM_ENVS = {"ant_gather": 20, "snake_gather": 13, "block_hopper": 50, "block_half_cheetah": 50}  # of the paper's batch
 # (what, environment) -> the least ratio to bare stepping that we aim at
 TARGETS = {
-    ("environment", "ant_gather"): 0.85,
-    ("environment", "block_half_cheetah"): 0.8,
     ("HiPPO random p", "ant_gather"): 0.65,
     ("HiPPO random p", "snake_gather"): 0.9,
     ("HiPPO random p", "block_hopper"): 0.6,
     ("HiPPO random p", "block_half_cheetah"): 0.65,
 }
-
-
-def rate(step: Callable[[], object], steps_per_call: int, seconds: float) -> float:
-    """Steps per second of repeated calls."""
-    calls, start = 0, time.perf_counter()
-    while time.perf_counter() - start < seconds:
-        step()
-        calls += 1
-    return calls * steps_per_call / (time.perf_counter() - start)
-
-
-def physics_and_environment(name: str, num_envs: int, seconds: float, rounds: int = 7) -> tuple[float, float]:
-    """Steps per second of bare `Batch.step` and of our vector environment, interleaved, median of `rounds`.
-
-    Both take the same random actions; bare stepping computes no stage at the new state.
-    """
-    env = make(name, num_envs, 0)
-    env.reset(seed=0)
-    bare = Batch(env.physics.model, num_envs, 1)
-    bare.state[:] = env.physics.get_state()
-    ctrl, rng = bare.bind("ctrl"), np.random.default_rng(0)
-    control_range = np.asarray(env.physics.model.actuator_ctrlrange)
-    low, high = control_range[:, 0], control_range[:, 1]
-    actions = rng.uniform(-1, 1, (256, *(env.action_space.shape or ())))
-    controls = low + (actions + 1) / 2 * (high - low)
-    clock = {"bare": 0, "environment": 0}
-
-    def step_bare() -> None:
-        ctrl[:] = controls[clock["bare"] % 256]
-        bare.step(nstep=env.physics.frame_skip)
-        clock["bare"] += 1
-
-    def step_environment() -> None:
-        env.step(actions[clock["environment"] % 256])
-        clock["environment"] += 1
-
-    bare_rates, environment_rates = [], []
-    for _ in range(rounds):
-        bare_rates.append(rate(step_bare, num_envs, seconds))
-        environment_rates.append(rate(step_environment, num_envs, seconds))
-    return statistics.median(bare_rates), statistics.median(environment_rates)
 
 
 def training(run: Run, iterations: int) -> float:
@@ -90,14 +45,6 @@ def training(run: Run, iterations: int) -> float:
         log = RunLog(Path(folder), lambda _, timing: speeds.append(float(timing["steps_per_second"])))
         algorithm(run.algo).train(run.config, make_envs, log, 0, Checkpoint(Path(folder)))
     return statistics.median(speeds[1:]) if iterations > 1 else speeds[0]
-
-
-def lidar_microseconds(num_envs: int = 64) -> float:
-    """Cost of the lidar for all environments, per step."""
-    rng = np.random.default_rng(0)
-    com, yaw = rng.uniform(-6, 6, (num_envs, 2)), rng.uniform(-3, 3, num_envs)
-    objects, present = rng.uniform(-6, 6, (num_envs, 16, 2)), np.ones((num_envs, 16), bool)
-    return 1e6 / rate(lambda: lidar(com, yaw, objects, present), 1, 0.5)
 
 
 def peak_memory(overrides: list[str]) -> float:
@@ -130,7 +77,7 @@ def main() -> int:
     torch.set_num_threads(1)
     seconds, iterations = (0.2, 2) if options.quick else (1.0, 4)
     print(f"{'environment':20} {'what':22} {'steps/s':>12} {'of bare':>8}   target", flush=True)
-    for name in ENVIRONMENTS:
+    for name in NUM_ENVS:
         bare, environment = physics_and_environment(name, NUM_ENVS[name], seconds)
         print(line("bare Batch.step", name, bare, bare))
         print(line("environment", name, environment, bare), flush=True)
@@ -140,7 +87,13 @@ def main() -> int:
             speed = training(run, iterations)
             after, _ = physics_and_environment(name, NUM_ENVS[name], seconds / 2, rounds=3)
             print(line(what, name, speed, (before + after) / 2), flush=True)
-    print(f"lidar, 64 environments: {lidar_microseconds():.0f} microseconds a step (target <= 150)")
+    for part in (bench_environments, bench_scaling, bench_peers):
+        print()
+        for row in part.lines(options.quick):
+            print(row, flush=True)
+    faster, overhead = bench_sweeps.throughput_and_overhead(3 if options.quick else 20)
+    print(f"\ntwo workers: {faster:.2f} times the throughput of one (target >= 1.8, needs two idle cores)")
+    print(f"launcher: {overhead:.2f} s per run beyond training, after a worker's first (target < 0.5)")
     if not options.quick:
         memory = peak_memory(["env=ant_gather", "algo=hippo", "scale=paper", "iterations=1"])
         print(f"peak memory, HiPPO on Ant Gather at the paper's batch: {memory:,.0f} MB (target <= 1,000)")

@@ -22,8 +22,8 @@ from hydra.errors import HydraException
 from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from hippo.core import checkpoint
 from hippo.core.settings import ConfigError
+from hippo.core.skills import SkillsError, read_skills
 from hippo.envs import ENVIRONMENTS
 from hippo.envs.registration import Options, check_option
 
@@ -34,6 +34,8 @@ ALGORITHMS = {
     "hippo": ("hippo.hippo", "HippoConfig"),
     "ppo": ("baselines.ppo", "PPOConfig"),
     "hier_vpg": ("baselines.hier_vpg", "HierVPGConfig"),
+    "snn": ("baselines.snn", "SNNConfig"),
+    "diayn": ("baselines.diayn", "DIAYNConfig"),
     "mlsh": ("baselines.mlsh", "MLSHConfig"),
     "option_critic": ("baselines.option_critic", "OptionCriticConfig"),
 }
@@ -158,7 +160,7 @@ class Run:
         robot = ENVIRONMENTS[self.env].robot
         shared = {name: getattr(self.config, name) for name in SHARED_WITH_SKILLS if hasattr(self.config, name)}
         overrides = [f"algo.{name}={json.dumps(value)}" for name, value in shared.items()]
-        overrides += [f"env.observation={self.options['observation']}"] * ("observation" in self.options)
+        overrides += [f"env.{name}={value}" for name, value in self.options.items() if name == "observation"]
         chosen = [f"env={robot}", f"algo={PRETRAINING[robot]}", f"scale={self.scale}", f"runs_dir={self.runs_dir}"]
         return compose_run([*chosen, *overrides])
 
@@ -230,11 +232,7 @@ def digest(path: Path) -> str:
 def committed_skills(run: Run) -> Path | None:
     """The committed skills file, if it is the one that the pre-training `run` would make."""
     path = COMMITTED / "skills" / f"{run.env}.pt"
-    return (
-        path
-        if run.kind == "pretrain" and path.exists() and checkpoint.load(path)["metadata"]["run_id"] == run.run_id
-        else None
-    )
+    return path if run.kind == "pretrain" and path.exists() and read_skills(path)[0]["run_id"] == run.run_id else None
 
 
 def default_of(f: dataclasses.Field) -> Any:
@@ -351,6 +349,19 @@ def _as_config_error(key: str, value: Any) -> Iterator[None]:
         raise ConfigError(key, value, str(error).splitlines()[0]) from error
 
 
+def _check_skills(path: str, env: dict[str, Any], settings: dict[str, Any]) -> None:
+    """Refuse a skills file that cannot be read, or is for another robot, observation or network."""
+    try:
+        metadata, _ = read_skills(Path(path))
+    except SkillsError as error:
+        raise ConfigError("algo.skills", path, f"must be {PRETRAINED} or a skills file ({error})") from error
+    wanted = {"robot": ENVIRONMENTS[env["name"]].robot, "observation": env["observation"]}
+    wanted |= {name.removeprefix("skill_"): settings[name] for name in SHARED_WITH_SKILLS if name in settings}
+    for key, value in wanted.items():
+        if metadata[key] != value:
+            raise ConfigError("algo.skills", path, f"has {key} {metadata[key]}, this run needs {value}")
+
+
 def _validated(config: DictConfig, algo: str) -> Run:
     with _as_config_error("config", algo):
         plain = OmegaConf.to_container(config, resolve=True)
@@ -371,8 +382,8 @@ def _validated(config: DictConfig, algo: str) -> Run:
                 raise ConfigError(f"env.{f.name}", env[f.name], str(error).split(": ", 1)[1]) from error
             options[f.name] = env[f.name]
     skills = plain["algo"].get("skills", "")
-    if skills not in ("", PRETRAINED) and not Path(skills).is_file():
-        raise ConfigError("algo.skills", skills, f"must be {PRETRAINED} or a skills file")
+    if skills not in ("", PRETRAINED):
+        _check_skills(skills, env, plain["algo"])
     check_choice("wandb.mode", plain["wandb"]["mode"], WANDB_MODES)
     if not plain["runs_dir"]:
         raise ConfigError("runs_dir", "", "must name a folder")

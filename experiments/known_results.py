@@ -28,11 +28,13 @@ PUBLISHED = (2000, 2250)  # PPOC, Hopper-v1, two options, 10^6 steps, all delibe
 BUDGET: dict[str, Any] = {"iterations": 500, "batch_size": 2 * HORIZON, "horizon": HORIZON}
 VARIANTS: dict[str, dict[str, Any]] = {
     "option_critic": {"num_skills": 2, "log_std_per_skill": True},
+    "option_critic_half": {"num_skills": 2, "log_std_per_skill": True, "learning_rate": 1.5e-4},
     "option_critic_ppoc": {"num_skills": 2, "log_std_per_skill": True, "ppoc_faithful": True},
     "option_critic_ppo": {"num_skills": 1, "minibatch_size": 64, "critic_minibatch_size": 64},
 }
 LABELS = {
     "option_critic": "Option-Critic, 2 options",
+    "option_critic_half": "at half the step size, 2 options",
     "option_critic_ppoc": "with PPOC's losses, 2 options",
     "option_critic_ppo": "1 option (PPO)",
 }

@@ -134,7 +134,8 @@ def make_plan(figure: str, scale: str, settings: Sequence[str], fresh: bool, run
                 continue
             chosen = [f"env={env}", f"algo={what['algo']}", f"scale={scale}", f"runs_dir={runs_dir}"]
             kind = what.get("kind", description.get("kind"))
-            first = compose_run([*chosen, *of_env, *what.get("settings", []), *settings])
+            of_scale = what.get("scale_settings", {}).get(scale, [])
+            first = compose_run([*chosen, *of_env, *what.get("settings", []), *of_scale, *settings])
             if kind is not None:
                 evaluation = description["evaluation"] if kind == "evaluate" else None
                 first = dataclasses.replace(first, kind=kind, evaluation=evaluation)

@@ -33,6 +33,7 @@ from hippo.core.checkpoint import Checkpoint, CheckpointError
 from hippo.core.log import Diverged, Row, RunLog
 from hippo.core.mirror import mirrored
 from hippo.core.settings import ConfigError
+from hippo.core.skills import SkillsError, save_skills
 from hippo.envs import make
 
 EXIT_CODES = {"finished": 0, "running": 0, "failed": EXIT_FAILED, "diverged": EXIT_DIVERGED, "preempted": EXIT_REQUEUE}
@@ -94,7 +95,7 @@ def _execute_locked(run: Run) -> str:
             message = f"{error or type(error).__name__}; start it again to continue from the last checkpoint"
             status.end("failed", message, cause="infrastructure")
             print(f"error: {message}", file=sys.stderr)
-        except CheckpointError as error:
+        except (CheckpointError, SkillsError) as error:
             status.end("failed", str(error), cause="error")
             print(f"error: {error}", file=sys.stderr)
         except Exception as error:
@@ -164,8 +165,6 @@ def train(run: Run, status: Status) -> None:
 
 def pretrain(run: Run, status: Status) -> None:
     """Train skills and write them to skills.pt."""
-    from hippo.core.skills import save_skills
-
     train(run, status)
     policy, metadata = algorithm(run.algo).skills(run.config, prepare(run), Checkpoint(run.folder))
     save_skills(run.folder / "skills.pt", policy, metadata | {"run_id": run.run_id})

@@ -29,6 +29,7 @@ from hippo.core.hierarchy import HierarchicalPolicy, HierarchyConfig, collect, l
 from hippo.core.log import RunLog, check_finite
 from hippo.core.ppo import maximize
 from hippo.core.settings import ConfigError, setting
+from hippo.core.skills import start_from
 
 __all__ = ["HippoConfig", "rollout", "train"]
 
@@ -70,6 +71,7 @@ def train(config: HippoConfig, make_envs: MakeEnvs, log: RunLog, seed: int, chec
     obs_size, action_size = envs.single_observation_space.shape[0], envs.single_action_space.shape[0]
     generator = seeding.torch_generator(seed, "initialisation")
     policy = HierarchicalPolicy(config, obs_size, envs.robot_size, action_size, generator)
+    start_from(config.skills, policy.skills, envs)
     baselines = Baselines(config, obs_size, generator)
     # A frozen level stays out of the optimiser, log-std included.
     networks = {"manager": policy.manager, "skill": policy.skills}

@@ -83,6 +83,8 @@ def caption(results: Results, seeds: dict[str, dict[str, int]]) -> str:
     ]
     if plan["scale"] in NOT_A_RESULT:
         lines.append("Smoke scale runs every code path in minutes; it says nothing about the methods.")
+    if plan.get("not_trained"):
+        lines.append(f"Not trained at this scale: {', '.join(e['env_label'] for e in plan['not_trained'])}.")
     lines += [f"Missing or incomplete: {what}." for what in results.missing_lines()]
     return "\n".join(lines) + "\n"
 
@@ -109,6 +111,7 @@ def draw(results: Results, out: Path, extra: Extra | None = None) -> list[Path]:
     style.use()
     plan = results.plan
     environments, variants = unique(results, "env"), unique(results, "variant")
+    environments |= {left_out["env"]: left_out["env_label"] for left_out in plan.get("not_trained", [])}
     columns = min(4, len(environments))
     rows = -(-len(environments) // columns) + (extra is not None)
     figure, grid = plt.subplots(

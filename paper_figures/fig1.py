@@ -20,7 +20,7 @@ CAPTION = (
 MANAGER, SKILL, STATE = "#0072B2", "#D55E00", "#F2F2F2"
 TOP, MIDDLE, BOTTOM = 3.0, 1.5, 0.0  # rows: manager, skill, environment
 COLUMNS = (0.0, 1.7, 4.3, 6.5, 8.2)  # s_kp, s_kp+1, the end of the commitment, the next decision, after it
-DOTS = 3.0
+DOTS, LABELS = 3.0, -2.3  # where columns are left out; where the rows' names begin
 
 
 def box(axes: Axes, x: float, y: float, text: str, face: str, ink: str = "white") -> None:
@@ -55,30 +55,29 @@ def draw(axes: Axes) -> None:
             continue
         box(axes, x, MIDDLE, r"$\pi_{\theta_l}(a|s,z)$", SKILL)
         arrow(axes, (x - 0.3, BOTTOM + 0.33), (x - 0.3, MIDDLE - 0.33))
-        arrow(axes, (x + 0.3, MIDDLE - 0.33), (x + 0.3, BOTTOM + 0.33))
-        axes.text(x + 0.36, (MIDDLE + BOTTOM) / 2, action, va="center", fontsize=8)
-        if i != 2:  # between the second column and the third steps are left out
-            following = COLUMNS[i + 1] - 0.63 if i != 1 else DOTS - 0.25
-            arrow(axes, (x + 0.63, BOTTOM), (following, BOTTOM))
-        else:
-            arrow(axes, (x + 0.63, BOTTOM), (COLUMNS[3] - 0.63, BOTTOM))
+        # an action goes into the transition to the next state
+        arrow(axes, (x + 0.3, MIDDLE - 0.33), (x + 0.8, BOTTOM + 0.05))
+        axes.text(x + 0.64, (MIDDLE + BOTTOM) / 2, action, va="center", fontsize=8)
+        following = DOTS - 0.25 if i == 1 else COLUMNS[i + 1] - 0.63
+        arrow(axes, (x + 0.63, BOTTOM), (following, BOTTOM))
     for y in (BOTTOM, MIDDLE):
         axes.text(DOTS, y, r"$\cdots$", ha="center", va="center", fontsize=12)
     arrow(axes, (DOTS + 0.25, BOTTOM), (COLUMNS[2] - 0.63, BOTTOM))
 
+    rail = (TOP + MIDDLE) / 2 + 0.1
     for x, z, end in ((COLUMNS[0], "$z_{kp}$", COLUMNS[2]), (COLUMNS[3], "$z_{(k+1)p}$", COLUMNS[4])):
         box(axes, x, TOP, r"$\pi_{\theta_h}(z|s)$", MANAGER)
         arrow(axes, (x - 0.5, BOTTOM + 0.33), (x - 0.5, TOP - 0.33), connectionstyle="arc3,rad=-0.28")
-        rail = (TOP + MIDDLE) / 2 + 0.1
         axes.plot([x, x], [TOP - 0.33, rail], color=MANAGER, lw=1.4)
         axes.plot([x, end], [rail, rail], color=MANAGER, lw=1.4, ls="-" if end == COLUMNS[2] else (0, (4, 2)))
-        axes.text(x + 0.12, rail + 0.2, z, fontsize=8, color=MANAGER)
-    rail = (TOP + MIDDLE) / 2 + 0.1
+        axes.text(x + 0.1, rail + 0.14, z, va="center", fontsize=8, color=MANAGER)
     for x in COLUMNS[:4]:
         arrow(axes, (x, rail), (x, MIDDLE + 0.33), color=MANAGER)
     arrow(axes, (COLUMNS[0] - 0.6, -0.72), (COLUMNS[2] + 0.6, -0.72), arrowstyle="<->")
-    axes.text((COLUMNS[0] + COLUMNS[2]) / 2, -0.98, "time commitment: p steps", ha="center", va="center", fontsize=8)
-    axes.set_xlim(-1.1, COLUMNS[-1] + 0.8)
+    axes.text((COLUMNS[0] + COLUMNS[2]) / 2, -0.98, "time commitment: $p$ steps", ha="center", va="center", fontsize=8)
+    for y, role in ((TOP, "manager"), (MIDDLE, "sub-policy\n(skill)"), (BOTTOM, "environment")):
+        axes.text(LABELS, y, role, ha="left", va="center", fontsize=8, color="#555555")
+    axes.set_xlim(LABELS, COLUMNS[-1] + 0.8)
     axes.set_ylim(-1.2, TOP + 0.5)
     axes.set_aspect("equal")
     axes.axis("off")

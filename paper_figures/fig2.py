@@ -19,7 +19,8 @@ from paper_figures.command_line import parse
 TITLE = "The environments"
 CAPTION = (
     "Environments used to evaluate the methods. Every episode has a different configuration: wall heights for (a) and "
-    "(b), positions of apples (green balls) and bombs (red cubes) for (c) and (d); thin rays are lidar readings."
+    "(b), positions of apples (green balls) and bombs (red cubes) for (c) and (d); a thin ray is a lidar reading, along "
+    "the middle of its bin and as long as the nearest object is far."
 )
 PANELS = {
     "block_hopper": "(a) Block Hopper",
@@ -65,7 +66,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         FRAMES.mkdir(parents=True, exist_ok=True)
         for name, picture in pictures.items():
             plt.imsave(FRAMES / f"{name}.png", picture)
-    figure, grid = plt.subplots(1, 4, figsize=(style.WIDTH, 1.75), layout="constrained")
+    figure, grid = plt.subplots(1, 4, figsize=(style.WIDTH, 1.6), layout="constrained")
     for axes, (name, label) in zip(grid, PANELS.items(), strict=True):
         axes.imshow(pictures[name])
         axes.set_title(label, fontsize=8)

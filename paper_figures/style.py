@@ -17,10 +17,16 @@ COLORS = {
     "ppo": "#D55E00",
     "ppo_repeat": "#E69F00",
     "hier_vpg": "#009E73",
+    "option_critic": "#000000",
+    "mlsh": "#8C564B",
+    "hiro": "#999933",
+    "adapted_p10": "#332288",
+    "adapted_random": "#88CCEE",
+    "fixed_p10": "#882255",
     "hippo_random_single": "#7B3294",
     "hippo_p10_single": "#A6761D",
 }
-SPARE_COLORS = ("#000000", "#7F7F7F", "#8C564B", "#17BECF")
+SPARE_COLORS = ("#7F7F7F", "#17BECF", "#AA4499", "#117733")
 
 RC: dict[str, Any] = {
     "font.family": "DejaVu Sans",

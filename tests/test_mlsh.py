@@ -21,7 +21,8 @@ from hippo.core.minibatch import maximize_in_minibatches, minibatches
 from hippo.core.policies import Manager
 from hippo.core.ppo import Level, maximize
 from hippo.core.settings import ConfigError
-from tests.toy import TargetEnv, progress, run
+from hippo.core.skills import SkillsError
+from tests.toy import TargetEnv, given_skills, progress, run
 
 MATCHED = {
     "manager_learning_rate": 3e-3,
@@ -292,6 +293,15 @@ def test_a_trained_hierarchy_is_evaluated_without_exploration_and_in_random_conf
     trained.manager.exploration = 0.0
     batch = collect(trained, TargetEnv(10, 3), config, 1, 0, greedy=True)
     assert torch.equal(batch.steps.action, greedy[0].action)
+
+
+def test_a_run_starts_from_given_skills_bit_by_bit_and_refuses_others_by_name(tmp_path):
+    state = given_skills(tmp_path / "skills.pt")
+    run(mlsh.train, config_of(skills=str(tmp_path / "skills.pt")), tmp_path / "warm-up")
+    after_warm_up = load(tmp_path / "warm-up/checkpoint.pt")["policy"]
+    assert all(torch.equal(after_warm_up[f"skills.{name}"], value) for name, value in state.items())
+    with pytest.raises(SkillsError, match="its num_skills is 3, the policy's 4"):
+        run(mlsh.train, config_of(skills=str(tmp_path / "skills.pt"), num_skills=4), tmp_path / "wrong")
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,8 @@ from hippo.core.options import ObservationFilter, Options
 from hippo.core.policies import GaussianPolicy
 from hippo.core.ppo import Level, maximize
 from hippo.core.settings import ConfigError
-from tests.toy import TargetEnv, progress, run
+from hippo.core.skills import SkillsError
+from tests.toy import TargetEnv, given_skills, progress, run
 
 NETWORKS = ("skills", "critic", "manager", "termination")
 ALWAYS, NEVER = 60.0, -60.0  # a termination bias with which options end at once, or not before their episode
@@ -529,6 +530,30 @@ def test_the_filter_has_the_mean_and_deviation_of_everything_seen_and_clips_at_f
     assert float(y[:, 2].std()) < 0.02  # a nearly constant entry is not blown up
     assert float(observation_filter(torch.full((1, 3), 1e5)).max()) == 5
     torch.testing.assert_close(torch.from_numpy(observation_filter.actor()(x.numpy())), y)
+
+
+# --- given skills -----------------------------------------------------------------------------------------------------
+
+
+def test_a_run_starts_from_given_skills_bit_by_bit_with_observations_as_they_are(tmp_path, monkeypatch):
+    state = given_skills(tmp_path / "skills.pt")
+    monkeypatch.setattr(oc, "update", lambda *_: {})
+    for name, settings in (("given", {"skills": str(tmp_path / "skills.pt")}), ("scratch", {})):
+        run(oc.train, config_of(**settings), tmp_path / name)
+    given, scratch = (load(tmp_path / name / "checkpoint.pt")["policy"] for name in ("given", "scratch"))
+    assert all(torch.equal(given[f"skills.{name}"], value) for name, value in state.items())
+    assert not torch.equal(scratch["skills.first.weight"], state["first.weight"])
+    assert (given["filter.count"], scratch["filter.count"]) == (0, 200)  # a filter would change what the skills compute
+
+
+def test_given_skills_of_another_shape_are_refused_by_name(tmp_path):
+    given_skills(tmp_path / "skills.pt")
+    for settings, message in (
+        ({"num_skills": 6}, "its num_skills is 3, the policy's 6"),
+        ({"log_std_per_skill": True}, "its log_std_per_skill is False, the policy's True"),
+    ):
+        with pytest.raises(SkillsError, match=message):
+            run(oc.train, config_of(skills=str(tmp_path / "skills.pt"), **settings), tmp_path / "wrong")
 
 
 # --- settings ---------------------------------------------------------------------------------------------------------

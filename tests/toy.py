@@ -5,9 +5,12 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import torch
 
 from hippo.core.checkpoint import Checkpoint
 from hippo.core.log import RunLog
+from hippo.core.policies import SkillPolicy
+from hippo.core.skills import save_skills
 
 
 class TargetEnv(gym.vector.VectorEnv):
@@ -65,3 +68,12 @@ def progress(folder: Path) -> dict[str, np.ndarray]:
     lines = [line.split(",") for line in (folder / "progress.csv").read_text().splitlines()]
     table = np.array(lines[1:], dtype=float)
     return dict(zip(lines[0], table.T, strict=True))
+
+
+def given_skills(path: Path) -> dict[str, Any]:
+    """Write a file of three skills for TargetEnv; returns the state of their network."""
+    policy = SkillPolicy(2, 3, 2, [64, 64], torch.Generator().manual_seed(5))
+    metadata = {"robot": "toy", "observation": "paper"}
+    metadata |= {"env": "toy", "algo": "snn", "run_id": "0", "env_steps": 1, "physics": "paper"}
+    save_skills(path, policy, metadata)
+    return policy.state_dict()

@@ -97,6 +97,12 @@ class HierarchyConfig:
     log_std_per_skill: bool = setting(
         False, "one log-std vector per skill instead of a shared one", code="shared (test2_hier_snn_mlp_policy.py:226)"
     )
+    skills: str = setting(
+        "",
+        "skills file that the lower level starts from; empty: from scratch",
+        paper="from scratch; given skills in Fig. 6",
+        code="-snnp, a pickle (test2_hier_snn_mlp_policy.py:122)",
+    )
     truncate_to_period: bool = setting(
         False,
         "do not learn from the steps of an episode after its last whole period, as the authors with fixed p",

@@ -22,6 +22,9 @@ OBJECT_RADIUS = 0.35  # m; they are caught from 1 m away
 WALL, WALL_HALF_WIDTH = np.array([0.25, 0.42, 0.68, 1.0]), 0.8  # m; the real ones cross the whole track
 RAY_RADIUS = 0.035  # m
 SKY = (250, 250, 252)  # where nothing is
+LINE, LINE_REACH, LINE_HALF_WIDTH = np.array([0.72, 0.74, 0.77, 1.0], np.float32), 25, 0.012  # m; every metre
+LINE_HEIGHT = 0.004  # m; the floor's own surface would flicker through
+ARENA = 6.5  # m from the middle to the walls
 
 
 class Scene(Protocol):
@@ -78,6 +81,8 @@ class Renderer:
         self._context.make_current()
         every = mujoco.mjtCatBit.mjCAT_ALL
         mujoco.mjv_updateScene(model, data, self._option, None, self.camera, every, self._scene)
+        shade(self._scene, has_shadows=not isinstance(self.envs.task, Gather))  # rays would throw them too
+        draw_floor(self._scene, self.envs, env)
         draw_task(self._scene, self.envs, env)
         mujoco.mjr_render(self._rectangle, self._scene, self._mujoco)
         image = np.empty((self._rectangle.height, self._rectangle.width, 3), np.uint8)
@@ -117,6 +122,7 @@ class Viewer:
             mujoco.mj_forward(self.envs.physics.model, self._data)
             follow(self._window.cam, self.envs, env)
             self._window.user_scn.ngeom = 0
+            draw_floor(self._window.user_scn, self.envs, env)
             draw_task(self._window.user_scn, self.envs, env)
         self._window.sync()
 
@@ -128,7 +134,7 @@ class Viewer:
 def lit(model: mujoco.MjModel) -> mujoco.MjModel:
     """A copy for the eye: bright, with a floor that reaches the horizon and walls that do not hide what is behind."""
     bright = copy.deepcopy(model)
-    bright.vis.headlight.ambient[:], bright.vis.headlight.diffuse[:] = 0.55, 0.45
+    bright.vis.headlight.ambient[:], bright.vis.headlight.diffuse[:] = 0.45, 0.25
     bright.geom("floor").size[:2] = 0  # drawn without end
     for i in range(bright.ngeom):
         if bright.geom(i).name.startswith("block_"):
@@ -140,17 +146,50 @@ def aim(camera: mujoco.MjvCamera, envs: Scene) -> None:
     """From above where the task is in the plane, from the side along a track."""
     camera.type = mujoco.mjtCamera.mjCAMERA_FREE
     if isinstance(envs.task, Gather):
-        camera.distance, camera.elevation, camera.azimuth = 22.0, -55.0, 90.0
+        camera.distance, camera.elevation, camera.azimuth = 20.0, -58.0, 90.0
     elif envs.robot.yaw is not None:
         camera.distance, camera.elevation, camera.azimuth = 6.0, -30.0, 90.0
     else:
-        camera.distance, camera.elevation, camera.azimuth = 4.2, -16.0, 80.0
+        camera.distance, camera.elevation, camera.azimuth = 4.8, -16.0, 80.0
 
 
 def follow(camera: mujoco.MjvCamera, envs: Scene, env: int) -> None:
-    """Look at the robot; in the arena, at its middle, so that all of it stays in view."""
-    com = envs.physics.com[env]
-    camera.lookat[:] = (0.0, 0.0, 0.0) if isinstance(envs.task, Gather) else (com[0], com[1], 0.5)
+    """Look at the robot, along a track a little ahead of it; in the arena at its middle, as long as the robot is there.
+
+    The Snake passes through the arena's walls unless the task has them solid.
+    """
+    x, y = envs.physics.com[env, :2]
+    if isinstance(envs.task, Gather):
+        camera.lookat[:] = (x - np.clip(x, -ARENA, ARENA), y - np.clip(y, -ARENA, ARENA), 0.0)
+    elif envs.robot.yaw is not None:
+        camera.lookat[:] = (x, y, 0.3)
+    else:
+        camera.lookat[:] = (x + 1.0, y, 0.5)
+
+
+def shade(scene: mujoco.MjvScene, has_shadows: bool) -> None:
+    """A lamp from above and behind the camera's shoulder; shadows tell whether a foot stands on the floor."""
+    light = scene.lights[scene.nlight]
+    light.type, light.castshadow, light.headlight = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, has_shadows, 0
+    light.dir[:] = np.array([0.25, 0.35, -0.9]) / np.linalg.norm([0.25, 0.35, -0.9])
+    light.pos[:] = scene.camera[0].pos
+    light.ambient[:], light.diffuse[:], light.specular[:] = 0.0, 0.45, 0.1
+    scene.nlight += 1
+
+
+def draw_floor(scene: mujoco.MjvScene, envs: Scene, env: int) -> None:
+    """Lines across the floor at every whole metre where the camera follows the robot, so that it is seen to move."""
+    if isinstance(envs.task, Gather):
+        return
+    floor = float(envs.physics.model.geom("floor").pos[2])
+    middle = np.rint(envs.physics.com[env, :2])
+    for axis in (0, 1):
+        size = np.full(3, LINE_REACH, float)
+        size[axis], size[2] = LINE_HALF_WIDTH, LINE_HEIGHT
+        for offset in range(-LINE_REACH, LINE_REACH + 1):
+            centre = np.array([*middle, floor])
+            centre[axis] += offset
+            _add_geom(scene, mujoco.mjtGeom.mjGEOM_BOX, size, centre, LINE)
 
 
 def draw_task(scene: mujoco.MjvScene, envs: Scene, env: int) -> None:
@@ -175,6 +214,10 @@ def _add_object(scene: mujoco.MjvScene, centre: np.ndarray, is_apple: bool) -> N
     """An apple is a green ball, a bomb a red cube."""
     kind, colour = (mujoco.mjtGeom.mjGEOM_SPHERE, APPLE) if is_apple else (mujoco.mjtGeom.mjGEOM_BOX, BOMB)
     size = np.full(3, OBJECT_RADIUS if is_apple else 0.8 * OBJECT_RADIUS)
+    _add_geom(scene, kind, size, centre, colour)
+
+
+def _add_geom(scene: mujoco.MjvScene, kind: int, size: np.ndarray, centre: np.ndarray, colour: np.ndarray) -> None:
     mujoco.mjv_initGeom(scene.geoms[scene.ngeom], kind, size, centre, np.eye(3).ravel(), colour)
     scene.ngeom += 1
 
