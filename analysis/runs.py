@@ -67,6 +67,8 @@ def load(
         # Not "whatever is there": a run folder may be half trained, and FRESH=1 means that committed rows do not count.
         if run["state"] == "committed":
             rows = committed.loc[committed["run_id"] == run["run_id"], ["env_steps", "metric", "value"]]
+        elif run["kind"] == "evaluate":
+            rows = read_episodes(runs_dir / run["run_id"] / "episodes.csv")
         else:
             rows = read_progress(runs_dir / run["run_id"] / "progress.csv", metrics)
         expected = run["iterations"] if run["kind"] == "train" else 1
@@ -92,6 +94,15 @@ def read_progress(path: Path, metrics: Sequence[str] | None) -> pd.DataFrame:
     table = pd.read_csv(io.StringIO(whole))
     columns = [c for c in table.columns if c not in ("iteration", "env_steps") and (metrics is None or c in metrics)]
     return table.melt(id_vars="env_steps", value_vars=columns, var_name="metric")
+
+
+def read_episodes(path: Path) -> pd.DataFrame:
+    """env_steps (here the episode's number), metric "return:<perturbation>:<strength>", value of one evaluation."""
+    if not path.exists():
+        return pd.DataFrame(columns=["env_steps", "metric", "value"])
+    table = pd.read_csv(path, keep_default_na=False)
+    metric = "return:" + table["perturbation"] + ":" + table["strength"]
+    return pd.DataFrame({"env_steps": table["episode"], "metric": metric, "value": table["return"]})
 
 
 def read_committed(path: Path, scale: str) -> pd.DataFrame:

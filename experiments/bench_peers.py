@@ -55,7 +55,7 @@ def stable_baselines(name: str, num_envs: int, steps: int, iterations: int, proc
     from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
     one = functools.partial(gym.make, IDS[name])
-    envs = (SubprocVecEnv if processes else DummyVecEnv)([one] * num_envs)
+    envs = SubprocVecEnv([one] * num_envs, "fork") if processes else DummyVecEnv([one] * num_envs)
     learner = PPO(
         "MlpPolicy",
         envs,

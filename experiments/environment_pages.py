@@ -62,6 +62,28 @@ def summary(name: str) -> str:
     return "\n".join(["| | |", "|---|---|", *(f"| {key} | {value} |" for key, value in rows.items())])
 
 
+def robots() -> str:
+    """The robots alone: ids, sizes and times; their observation is the first part of their task's."""
+    tasks = {e.robot: name for name, e in ENVIRONMENTS.items() if name != e.robot}
+    lines = [
+        "| name | Gymnasium id | observation | actions | horizon | control step | options |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for name, task in tasks.items():
+        envs, whole = make(task, 1, 0), make(name, 1, 0)
+        if whole.observation_names != envs.observation_names[: envs.robot_size]:
+            raise ValueError(f"{name} does not observe what the robot of {task} does")
+        timing, action = whole.robot.timing("paper"), whole.single_action_space.shape
+        assert action is not None
+        observed = f"{whole.robot_size}: entries 0 to {whole.robot_size - 1} of [{task}]({task}.md#observation)"
+        step = f"{timing.frame_skip} x {timing.timestep:g} s"
+        valid = ", ".join(f"`{option}`" for option, values in ENVIRONMENTS[name].options.items() if len(values) > 1)
+        lines.append(
+            f"| `{name}` | `{gymnasium_id(name)}` | {observed} | {action[0]} | {whole.horizon} | {step} | {valid} |"
+        )
+    return "\n".join(lines)
+
+
 def perturbations() -> str:
     """What every perturbation multiplies on every robot, and whether its trajectories differ from the original's."""
     lines = [
@@ -102,6 +124,7 @@ def renewed(path: Path) -> str:
         "summary": lambda: summary(name),
         "observation": lambda: observation(name),
         "options": lambda: options(name),
+        "robots": robots,
         "perturbations": perturbations,
     }
     return MARK.sub(lambda m: f"{m[1]}{tables[m[2]]()}\n{m[3]}", path.read_text())

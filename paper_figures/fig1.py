@@ -19,7 +19,7 @@ CAPTION = (
 )
 MANAGER, SKILL, STATE = "#0072B2", "#D55E00", "#F2F2F2"
 TOP, MIDDLE, BOTTOM = 3.0, 1.5, 0.0  # rows: manager, skill, environment
-COLUMNS = (0.0, 1.7, 4.3, 6.5, 8.2)  # s_kp, s_kp+1, the end of the commitment, the next decision, after it
+COLUMNS = (0.0, 1.7, 4.3, 6.8, 8.5)  # s_kp, s_kp+1, the end of the commitment, the next decision, after it
 DOTS, LABELS = 3.0, -2.3  # where columns are left out; where the rows' names begin
 
 
@@ -87,7 +87,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Draw it; there is no data behind it, so every scale gives the same figure."""
     options = parse("fig1", arguments)
     style.use()
-    figure, axes = plt.subplots(figsize=(style.WIDTH, 3.4), layout="constrained")
+    figure, axes = plt.subplots(figsize=(style.WIDTH, 3.1), layout="constrained")
     draw(axes)
     stem = options.out / options.scale / "fig1"
     written = style.save(figure, stem, TITLE, "no data: a diagram")

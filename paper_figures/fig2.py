@@ -19,8 +19,8 @@ from paper_figures.command_line import parse
 TITLE = "The environments"
 CAPTION = (
     "Environments used to evaluate the methods. Every episode has a different configuration: wall heights for (a) and "
-    "(b), positions of apples (green balls) and bombs (red cubes) for (c) and (d); a thin ray is a lidar reading, along "
-    "the middle of its bin and as long as the nearest object is far."
+    "(b), positions of apples (green balls) and bombs (red cubes) for (c) and (d); a thin ray is a lidar reading, "
+    "along the middle of its bin and as long as the nearest object is far."
 )
 PANELS = {
     "block_hopper": "(a) Block Hopper",

@@ -12,7 +12,7 @@ import pandas as pd
 import yaml
 
 from analysis.runs import MissingData, Results, load
-from paper_figures import command_line
+from paper_figures import command_line, tabular
 
 HERE = Path(__file__).parent
 COSINES = {
@@ -47,7 +47,7 @@ def rows(results: Results) -> list[dict[str, str]]:
     for (env, variant), (env_label, variant_label) in labels.items():
         if (env, variant) not in measured:
             continue
-        values, printed = frame.loc[env, variant], paper[env]["random"]
+        values, printed = frame.loc[env, variant], paper[env]["given" if variant.startswith("given") else "random"]
         seeds = results.frame.query("env == @env and variant == @variant")["seed"].nunique()
         common = {"environment": env_label, "run": variant_label, "n": str(seeds)}
         for name, what in COSINES.items():
@@ -71,32 +71,6 @@ def rows(results: Results) -> list[dict[str, str]]:
     return table
 
 
-def markdown(table: list[dict[str, str]]) -> str:
-    """The table as Markdown."""
-    head = list(table[0])
-    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
-    return "\n".join([*lines, *("| " + " | ".join(row.values()) + " |" for row in table)]) + "\n"
-
-
-def latex(table: list[dict[str, str]], results: Results) -> str:
-    """The table as a LaTeX document that compiles alone (booktabs)."""
-
-    def escaped(text: str) -> str:
-        return text.replace("_", r"\_").replace("^", r"\^{}").replace("±", r"$\pm$")
-
-    ids = " ".join(sorted(set(results.frame["run_id"])))
-    lines = [
-        f"% runs: {ids}",
-        r"\documentclass{article}\usepackage{booktabs}\usepackage[margin=1cm,landscape]{geometry}",
-        r"\begin{document}\small",
-        rf"\begin{{tabular}}{{{'l' * len(table[0])}}}\toprule",
-        " & ".join(table[0]) + r" \\ \midrule",
-        *(" & ".join(escaped(v) for v in row.values()) + r" \\" for row in table),
-        r"\bottomrule\end{tabular}\end{document}",
-    ]
-    return "\n".join(lines) + "\n"
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Write table2.csv, .md and .tex, and print the table."""
     options = command_line.parse("table2", arguments)
@@ -106,12 +80,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"error: {error}", file=sys.stderr)
         return 2
     table, stem = rows(results), options.out / options.scale / "table2"
-    stem.parent.mkdir(parents=True, exist_ok=True)
-    results.frame.to_csv(stem.with_suffix(".csv"), index=False, lineterminator="\n")
     note = f"Scale: {options.scale}." + (" It says nothing about the methods." if options.scale == "smoke" else "")
-    text = f"{results.plan['title']}. {note}\n\n{markdown(table)}"
-    stem.with_suffix(".md").write_text(text)
-    stem.with_suffix(".tex").write_text(latex(table, results))
+    comment = "runs: " + " ".join(sorted(set(results.frame["run_id"])))
+    text = tabular.write(stem, results.plan["title"], note, table, comment)
+    results.frame.to_csv(stem.with_suffix(".csv"), index=False, lineterminator="\n")
     for what in results.missing_lines():
         print(f"missing or incomplete: {what}")
     print(text)

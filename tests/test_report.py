@@ -5,7 +5,7 @@ import re
 
 from analysis import report
 from analysis.runs import Results
-from paper_figures import table2
+from paper_figures import table2, tabular
 
 
 def test_hostile_names_are_escaped_and_nothing_is_loaded_from_elsewhere(tmp_path):
@@ -60,8 +60,8 @@ def test_table_2_shows_every_definition_beside_the_papers_numbers():
     assert (own["ours"], own["paper"]) == ("0.400 ± 0.050", "0.31 ± 0.09")
     assert by["max other^9", "joint density"]["ours"] == "1.0e-09"
     assert by["(max other / own)^10", "joint density"]["ours"] == "9.5e-07"  # 0.25 ** 10
-    text = table2.latex(table, results)
+    text = tabular.latex(table, "runs: ab")
     assert r"random\_skills" in text
     assert "% runs: ab" in text
     assert "±" not in text
-    assert report.markdown_table(table2.markdown(table))[1] == list(table[0].values())
+    assert report.markdown_table(tabular.markdown(table))[1] == list(table[0].values())
