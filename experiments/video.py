@@ -61,6 +61,7 @@ class Recorded:
 @contextlib.contextmanager
 def streamed(path: Path) -> Iterator[Any]:
     """A function that appends a frame (H, W, 3) to the video at `path`; a part of a video is never left there."""
+    path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f"{path.stem}.part{path.suffix}")
     try:
         writer: Any = imageio.get_writer(part, fps=FRAMES_PER_SECOND, macro_block_size=None)
@@ -101,6 +102,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         run = load_run(options.run)
         path = options.out or options.run / "video.mp4"
+        if path.suffix != ".mp4":
+            raise ConfigError("out", path, "must end in .mp4")
+        if options.seed < 0:
+            raise ConfigError("seed", options.seed, "must be at least 0")
         changes = {"perturbation": options.perturbation, "strength": options.strength}
         total = record(run, path, options.seed, options.greedy, **changes)
     except (ConfigError, CheckpointError) as error:

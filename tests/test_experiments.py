@@ -284,11 +284,15 @@ def test_a_measurement_trains_its_parent_first_and_shares_it(tmp_path, capsys):
     assert {(r["kind"], r["state"]) for r in plan["runs"]} == {("measure", "finished")}
     ids = {r["run_id"] for r in plan["runs"]}
     parents = {p.name for p in tmp_path.iterdir() if (p / "checkpoint.pt").exists()}
-    assert len(parents) == len(ids) == 8
+    skills = {p.name for p in tmp_path.iterdir() if (p / "skills.pt").exists()}
+    assert (len(ids), len(skills), len(parents - skills)) == (16, 2, 16)
     assert not parents & ids
-    # Paid for: 8 runs of one batch (400 steps, the Snake's too), and 8 measurements of two.
+    # Paid for: 16 runs of one batch (400 steps, the Snake's too), 16 measurements of two, two pre-trainings of four.
     again = make_plan("table2", "smoke", settings[1::2], False, tmp_path / "elsewhere")
-    assert (len(again.todo()), sum(run.env_steps for run in again.todo())) == (16, 8 * 400 + 8 * 800)
+    assert (len(again.todo()), sum(run.env_steps for run in again.todo())) == (
+        34,
+        16 * 400 + 16 * 800 + 2 * 4 * 2400,
+    )
     (row,) = (tmp_path / min(ids) / "progress.csv").read_text().splitlines()[1:]
     assert row.startswith("1,")  # the batch after one iteration of training
     run = compose_run(["env=ant_gather", "scale=smoke", *settings[1::2], f"runs_dir={tmp_path}"])

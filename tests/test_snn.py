@@ -90,7 +90,7 @@ def test_headings_come_from_the_entries_names():
 
 
 class TurnedRoamer(RoamEnv):
-    """Roams from a random place in a random direction: every path is the same but for where it starts and its heading."""
+    """Roams from a random place in a random direction: paths differ only in where they start and their heading."""
 
     observation_names = ("heading", "x_velocity", "y_velocity")
 
