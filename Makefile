@@ -34,8 +34,11 @@ $(FIGURES) $(TABLES): install
 
 all: $(FIGURES) $(TABLES)  ## every figure and table at SCALE
 
-report: install  ## one page with everything drawn at SCALE
+report: install claims  ## one page with everything drawn at SCALE
 	@$(PY) analysis.report $(DRAW_FLAGS)
+
+claims: install  ## the paper's comparative sentences and what the results at SCALE say about them
+	@$(PY) analysis.claims $(DRAW_FLAGS)
 
 plan-%: install
 	@$(PY) experiments.sweep plan $* $(SWEEP_FLAGS)
@@ -73,4 +76,4 @@ help:  ## this list
 	@echo "  make tableN      the same for: $(or $(TABLES),none yet)"
 	@echo "  make plan-figN   what it would train and cost, without training"
 
-.PHONY: install install-render all report lint test test-slurm smoke bench video clean help $(FIGURES) $(TABLES)
+.PHONY: install install-render all report claims lint test test-slurm smoke bench video clean help $(FIGURES) $(TABLES)

@@ -52,7 +52,9 @@ def render(scale: str, runs_dir: Path, out: Path) -> str:
         ledger = list(csv.reader(file))
     artefacts = [artefact(plan, out / scale) for plan in plans]
     template = Environment(autoescape=True).from_string((HERE / "report.html.j2").read_text())
-    return template.render(scale=scale, artefacts=artefacts, ledger=ledger)
+    claims = out / scale / "claims.md"
+    rows = markdown_table(claims.read_text()) if claims.exists() else []
+    return template.render(scale=scale, artefacts=artefacts, ledger=ledger, claims=rows)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -64,6 +64,18 @@ def write_seeds(axes: Axes, seeds: dict[str, int], variants: list[str]) -> None:
     axes.add_artist(box)
 
 
+def final_line(results: Results, env: str) -> str:
+    """The paper's own statistic in words: final performance of every method, mean ± standard deviation over seeds."""
+    words = []
+    for variant, label in unique(results, "variant").items():
+        seeds, _, table = scores(results.frame, env, variant)
+        if seeds:
+            final = np.array([stats.final_performance(table[seed].dropna().to_numpy()) for seed in seeds])
+            spread = f" ± {stats.standard_deviation(final):.3g}" if len(seeds) > 1 else ""
+            words.append(f"{label} {final.mean():.3g}{spread}")
+    return "; ".join(words)
+
+
 def caption(results: Results, seeds: dict[str, dict[str, int]]) -> str:
     """What the picture shows and how it was computed, for a reader who sees nothing else."""
     plan = results.plan
@@ -85,6 +97,9 @@ def caption(results: Results, seeds: dict[str, dict[str, int]]) -> str:
         lines.append("Smoke scale runs every code path in minutes; it says nothing about the methods.")
     if plan.get("not_trained"):
         lines.append(f"Not trained at this scale: {', '.join(e['env_label'] for e in plan['not_trained'])}.")
+    for env, label in unique(results, "env").items():
+        if final := final_line(results, env):
+            lines.append(f"Last 10 % of iterations, mean ± standard deviation over seeds, {label}: {final}.")
     lines += [f"Missing or incomplete: {what}." for what in results.missing_lines()]
     return "\n".join(lines) + "\n"
 
@@ -114,9 +129,11 @@ def draw(results: Results, out: Path, extra: Extra | None = None) -> list[Path]:
     environments |= {left_out["env"]: left_out["env_label"] for left_out in plan.get("not_trained", [])}
     columns = min(4, len(environments))
     rows = -(-len(environments) // columns) + (extra is not None)
-    figure, grid = plt.subplots(
-        rows, columns, figsize=(style.WIDTH, 2.25 * rows + 0.55), squeeze=False, layout="constrained"
-    )
+    # An entry takes about 0.6 in and 0.066 in a letter; more columns than fit would be cut at the edges.
+    legend_columns = max(1, min(5, int(style.WIDTH / (0.6 + 0.066 * max(map(len, variants.values()))))))
+    height = 2.25 * rows + 0.4 + 0.16 * -(-len(variants) // legend_columns)
+    figure, grid = plt.subplots(rows, columns, figsize=(style.WIDTH, height), squeeze=False, layout="constrained")
+    left_out_here = {left_out["env"] for left_out in plan.get("not_trained", [])}
     seeds = {}
     for axes, (env, label) in zip(grid.flat, environments.items(), strict=False):
         steps = results.frame.loc[results.frame["env"] == env, "env_steps"]
@@ -126,7 +143,8 @@ def draw(results: Results, out: Path, extra: Extra | None = None) -> list[Path]:
         axes.set_title(label)
         axes.set_xlabel(f"{name} env. steps")
         if not seeds[env]:
-            axes.text(0.5, 0.5, "not trained\nat this scale", transform=axes.transAxes, ha="center", va="center")
+            reason = "not trained\nat this scale" if env in left_out_here else "no results yet"
+            axes.text(0.5, 0.5, reason, transform=axes.transAxes, ha="center", va="center")
             axes.set_axis_off()
             continue
         axes.set_xlim(left=0)
@@ -138,8 +156,10 @@ def draw(results: Results, out: Path, extra: Extra | None = None) -> list[Path]:
         write_seeds(axes, seeds[env], list(variants))
     for axes in list(grid.flat)[len(environments) :]:
         axes.set_axis_off()
-    for axes in grid[:, 0]:
-        axes.set_ylabel("return")
+    for row in grid:
+        drawn = [axes for axes in row if axes.axison]
+        if drawn:
+            drawn[0].set_ylabel("return")
     if extra is not None:
         for axes, env in zip(grid[-1], environments, strict=False):
             axes.set_axis_on()
@@ -147,7 +167,7 @@ def draw(results: Results, out: Path, extra: Extra | None = None) -> list[Path]:
             extra.draw(axes, results, env)
         grid[-1, 0].set_ylabel(extra.label)
     handles = [Line2D([], [], color=style.color_of(v, list(variants)), label=label) for v, label in variants.items()]
-    figure.legend(handles=handles, loc="outside upper center", ncols=min(5, len(handles)), columnspacing=1.2)
+    figure.legend(handles=handles, loc="outside upper center", ncols=legend_columns, columnspacing=1.2)
     if plan["scale"] in NOT_A_RESULT:
         style.watermark(figure, NOT_A_RESULT[plan["scale"]])
     stem = out / plan["scale"] / plan["figure"]

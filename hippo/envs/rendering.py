@@ -22,8 +22,9 @@ OBJECT_RADIUS = 0.35  # m; they are caught from 1 m away
 WALL, WALL_HALF_WIDTH = np.array([0.25, 0.42, 0.68, 1.0]), 0.8  # m; the real ones cross the whole track
 RAY_RADIUS = 0.035  # m
 SKY = (250, 250, 252)  # where nothing is
-LINE, LINE_REACH, LINE_HALF_WIDTH = np.array([0.72, 0.74, 0.77, 1.0], np.float32), 25, 0.012  # m; every metre
+LINE, LINE_REACH, LINE_HALF_WIDTH = np.array([0.72, 0.74, 0.77, 1.0], np.float32), 16, 0.012  # m; every metre
 LINE_HEIGHT = 0.004  # m; the floor's own surface would flicker through
+SHADOW_PIXELS = 1024  # a side of the shadow map; MuJoCo's 4096 take most of the time where a CPU draws
 ARENA = 6.5  # m from the middle to the walls
 
 
@@ -135,6 +136,7 @@ def lit(model: mujoco.MjModel) -> mujoco.MjModel:
     """A copy for the eye: bright, with a floor that reaches the horizon and walls that do not hide what is behind."""
     bright = copy.deepcopy(model)
     bright.vis.headlight.ambient[:], bright.vis.headlight.diffuse[:] = 0.45, 0.25
+    bright.vis.quality.shadowsize = SHADOW_PIXELS
     bright.geom("floor").size[:2] = 0  # drawn without end
     for i in range(bright.ngeom):
         if bright.geom(i).name.startswith("block_"):

@@ -21,9 +21,7 @@ from tests.slurm.cluster import Cluster, missing
 
 pytestmark = [
     pytest.mark.slurm,
-    pytest.mark.skipif(
-        bool(missing()), reason=f"not installed: {', '.join(missing())} (make test-slurm)"
-    ),
+    pytest.mark.skipif(bool(missing()), reason=f"not installed: {', '.join(missing())} (make test-slurm)"),
 ]
 FIGURE = {
     "title": "tiny",
