@@ -7,7 +7,6 @@ row says otherwise.
 """
 
 import argparse
-import resource
 import statistics
 import subprocess
 import sys
@@ -58,8 +57,9 @@ def peak_memory(overrides: list[str]) -> float:
 
 
 def own_peak() -> float:
-    """This process's peak resident memory in MB."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    """This process's peak resident memory in MB; getrusage's would include that of the process that started it."""
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(float(line.split()[1]) / 1024 for line in lines if line.startswith("VmHWM"))
 
 
 def line(what: str, name: str, speed: float, bare: float) -> str:

@@ -1,8 +1,8 @@
 """Locomotion of the robots alone, for the pre-training of skills: no walls, no objects.
 
 Ant and Snake are paid for the speed of their centre of mass less a control cost, as the inner robots of the authors'
-Gather tasks (the Ant's contact cost is left out: current MuJoCo reports no contact forces there). Hopper and
-Half-Cheetah are paid nothing: DIAYN brings its own reward.
+Gather tasks (the Ant's contact cost is left out: stepping does not compute those forces unless a sensor asks). Hopper
+and Half-Cheetah are paid nothing: DIAYN brings its own reward.
 """
 
 from typing import Any
