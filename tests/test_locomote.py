@@ -125,3 +125,16 @@ def test_the_position_is_appended_at_the_very_end_and_changes_nothing_before_it(
         assert not np.isclose(longer[:, -2:], located.com[:, :2], atol=1e-6).all(), "the torso, not the whole robot"
         actions = rng.uniform(-1, 1, plain.action_space.shape)
         obs, longer = plain.step(actions)[0], located.step(actions)[0]
+
+
+def test_the_centre_of_mass_of_a_diverged_simulation_is_its_last_finite_one():
+    envs = make("snake", 2, 0)
+    envs.reset(seed=0)
+    envs.physics.qpos[1, 0] += 49.0
+    _, _, _, _, info = envs.step(np.zeros((2, 4)))
+    last = info["com"][1].copy()
+    assert last[0] > 45
+    envs.physics.qvel[1, 0] = np.nan
+    _, _, _, truncated, info = envs.step(np.zeros((2, 4)))
+    assert truncated.tolist() == [False, True]
+    np.testing.assert_array_equal(info["com"][1], last)

@@ -149,6 +149,7 @@ class RobotTaskEnv(gym.vector.VectorEnv):
             raise ValueError(f"actions hold {np.count_nonzero(~np.isfinite(actions))} non-finite numbers")
         middle, half = (self._control_high + self._control_low) / 2, (self._control_high - self._control_low) / 2
         self.physics.ctrl[:] = middle + half * np.clip(actions, -1.0, 1.0)
+        com_before = self.com.copy()
         self.physics.step()
         self._clock += 1
 
@@ -160,7 +161,7 @@ class RobotTaskEnv(gym.vector.VectorEnv):
             reward, terminated = np.where(diverged, 0.0, reward), terminated & ~diverged
             info = {name: np.where(diverged, 0.0, term) for name, term in info.items()}
         truncated = ((self._clock >= self.horizon) & ~terminated) | diverged
-        info |= {"diverged": diverged, "com": self.com.copy()}
+        info |= {"diverged": diverged, "com": np.where(diverged[:, None], com_before, self.com)}
 
         obs = self._observe()
         done = terminated | truncated
