@@ -40,7 +40,11 @@ class DIAYNConfig(PretrainingConfig):
     """The settings of DIAYN beside those of all pre-training."""
 
     entropy_weight: float = setting(
-        0.1, "alpha, weight of the action entropy", code="0.1 (mujoco_all_diayn.py:39)", low=0
+        0.01,
+        "alpha, weight of the action entropy",
+        code="0.1 (mujoco_all_diayn.py:39)",
+        ours="a Gaussian's entropy has no bound: with 0.1 the action noise of Hopper's skills grew to 8",
+        low=0,
     )
     discriminator_hidden_sizes: list[int] = setting(
         [128, 128],
