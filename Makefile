@@ -51,6 +51,9 @@ lint: install  ## ruff (format and rules) and mypy
 test: install  ## every test but the slow ones
 	$(PY) pytest -m "not slow and not slurm"
 
+test-slow: install  ## the tests that take minutes
+	$(PY) pytest -m slow -s
+
 test-slurm: install  ## the launcher on a real one-node Slurm, installed by apt (as root) where it is missing
 	@$(PY) tests.slurm.cluster install || echo "no Slurm here and none to be installed: its tests are skipped" >&2
 	$(PY) pytest -m slurm tests/slurm
@@ -76,4 +79,4 @@ help:  ## this list
 	@echo "  make tableN      the same for: $(or $(TABLES),none yet)"
 	@echo "  make plan-figN   what it would train and cost, without training"
 
-.PHONY: install install-render all report claims lint test test-slurm smoke bench video clean help $(FIGURES) $(TABLES)
+.PHONY: install install-render all report claims lint test test-slow test-slurm smoke bench video clean help $(FIGURES) $(TABLES)

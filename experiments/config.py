@@ -38,6 +38,7 @@ ALGORITHMS = {
     "diayn": ("baselines.diayn", "DIAYNConfig"),
     "mlsh": ("baselines.mlsh", "MLSHConfig"),
     "option_critic": ("baselines.option_critic", "OptionCriticConfig"),
+    "hiro": ("baselines.hiro", "HiroConfig"),
 }
 BUDGET_FIELDS = ("iterations", "batch_size", "horizon")
 # Filled in from the run level, or descriptions that no override should touch.
@@ -349,6 +350,16 @@ def _as_config_error(key: str, value: Any) -> Iterator[None]:
         raise ConfigError(key, value, str(error).splitlines()[0]) from error
 
 
+@contextlib.contextmanager
+def _of_algo() -> Iterator[None]:
+    """Name a setting that an algorithm refuses by its key in the whole configuration."""
+    try:
+        yield
+    except ConfigError as error:
+        level = {"iterations": "", "batch_size": "", "horizon": "env."}.get(error.key, "algo.")
+        raise ConfigError(f"{level}{error.key}", error.value, error.valid) from error
+
+
 def _check_skills(path: str, env: dict[str, Any], settings: dict[str, Any]) -> None:
     """Refuse a skills file that cannot be read, or is for another robot, observation or network."""
     try:
@@ -367,12 +378,8 @@ def _validated(config: DictConfig, algo: str) -> Run:
         plain = OmegaConf.to_container(config, resolve=True)
     assert isinstance(plain, dict)
     env: dict[str, Any] = plain["env"]
-    try:
+    with _of_algo():
         settings = config_class(algo)(**plain["algo"])
-    except ConfigError as error:
-        level = {"iterations": "", "batch_size": "", "horizon": "env."}.get(error.key, "algo.")
-        key = f"{level}{error.key}"
-        raise ConfigError(key, error.value, error.valid) from error
     options = {}
     for f in dataclasses.fields(Options):
         if env[f.name] != f.default:
@@ -381,6 +388,9 @@ def _validated(config: DictConfig, algo: str) -> Run:
             except ValueError as error:
                 raise ConfigError(f"env.{f.name}", env[f.name], str(error).split(": ", 1)[1]) from error
             options[f.name] = env[f.name]
+    if hasattr(settings, "check_environment"):
+        with _of_algo():
+            settings.check_environment(ENVIRONMENTS[env["name"]].robot, options)
     skills = plain["algo"].get("skills", "")
     if skills not in ("", PRETRAINED):
         _check_skills(skills, env, plain["algo"])

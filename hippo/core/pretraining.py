@@ -9,7 +9,6 @@ import time
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-import gymnasium as gym
 import numpy as np
 import torch
 from torch import Tensor, nn
@@ -21,7 +20,7 @@ from hippo.core.log import RunLog, check_finite
 from hippo.core.normalize import standardize
 from hippo.core.policies import SkillPolicy, gaussian_entropy
 from hippo.core.ppo import Level, maximize
-from hippo.core.rollout import Steps
+from hippo.core.rollout import LastInfo, Steps
 from hippo.core.settings import ConfigError, check, setting
 from hippo.core.value import ValueFunction, explained_variance
 
@@ -72,18 +71,6 @@ class PretrainingConfig:
     def num_envs(self) -> int:
         """Slots that collect one horizon each; ceil(batch / horizon)."""
         return -(-self.batch_size // self.horizon)
-
-
-class LastInfo(gym.vector.VectorWrapper):
-    """The same environments, which keep the `info` of the last step."""
-
-    info: dict[str, Any]
-
-    def step(self, actions: np.ndarray) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """As the environments' own."""
-        result = self.env.step(actions)
-        self.info = result[-1]
-        return result
 
 
 @dataclass

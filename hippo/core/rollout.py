@@ -6,6 +6,7 @@ paper's MDP has a finite horizon) unless `bootstrap_horizon` says so.
 """
 
 import time
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -14,6 +15,18 @@ from torch import Tensor
 
 from hippo.core.episodes import episode_statistics
 from hippo.core.log import check_finite
+
+
+class LastInfo(gym.vector.VectorWrapper):
+    """The same environments, which keep the `info` of the last step."""
+
+    info: dict[str, Any]
+
+    def step(self, actions: np.ndarray) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """As the environments' own."""
+        result = self.env.step(actions)
+        self.info = result[-1]
+        return result
 
 
 class Steps:

@@ -1,0 +1,46 @@
+"""A bounded replay buffer of named columns, whose oldest rows make room for new ones."""
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+
+class Replay:
+    """Up to `size` rows; a row is one tensor per name in `shapes`. Memory is touched only as rows come in."""
+
+    def __init__(self, size: int, **shapes: tuple[int, ...]) -> None:
+        self.size, self.added = size, 0  # added: rows ever, of which the newest `size` are kept
+        self.columns = {name: torch.empty(size, *shape) for name, shape in shapes.items()}
+
+    def __len__(self) -> int:
+        return min(self.added, self.size)
+
+    def add(self, **rows: Tensor) -> None:
+        """Append rows (B, ...) of every column."""
+        assert rows.keys() == self.columns.keys()
+        count = len(next(iter(rows.values())))
+        where = (self.added + torch.arange(count)) % self.size
+        for name, values in rows.items():
+            self.columns[name][where] = values.to(torch.float32)
+        self.added += count
+
+    def sample(self, count: int, generator: torch.Generator) -> dict[str, Tensor]:
+        """`count` rows drawn uniformly with replacement, by name."""
+        where = torch.randint(len(self), (count,), generator=generator)
+        return {name: column[where] for name, column in self.columns.items()}
+
+    def clear(self) -> None:
+        """Forget all rows."""
+        self.added = 0
+
+    def state_dict(self) -> dict[str, Any]:
+        """The rows that are there; copied, since a view would be saved with all of the memory behind it."""
+        rows = {name: column[: len(self)].clone() for name, column in self.columns.items()}
+        return {"added": self.added, "columns": rows}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Take over what `state_dict` returned for a buffer of the same size."""
+        self.added = state["added"]
+        for name, column in self.columns.items():
+            column[: len(self)] = state["columns"][name]
