@@ -464,4 +464,5 @@ def train(config: HiroConfig, make_envs: MakeEnvs, log: RunLog, seed: int, check
         }
         log.row(metrics, walk.steps.timing(start, end - learner.seconds, end))
         checkpoint.record(iteration, **parts)
+    checkpoint.previous.unlink(missing_ok=True)  # it alone still holds the buffers, up to half a gigabyte
     envs.close()

@@ -103,7 +103,9 @@ def calibrate(runs: Iterable[Run]) -> dict[str, Any]:
 def measure(run: Run) -> Cost:
     """Train `run` for a moment, with its own number of environments, and look at the clock and the folder."""
     budget = {"iterations": ITERATIONS, "horizon": STEPS, "batch_size": STEPS * run.config.num_envs}
-    settings = {"skills": ""} if run.skills else {}
+    settings: dict[str, Any] = {"skills": ""} if run.skills else {}
+    if hasattr(run.config, "warmup_steps"):  # steps without updates say nothing about those with them
+        settings["warmup_steps"] = 0
     short = dataclasses.replace(run, config=dataclasses.replace(run.config, **budget, **settings))
     ends = []
     threads = torch.get_num_threads()
