@@ -13,6 +13,7 @@ the actions of its c steps most likely to the present lower level (off-policy co
 Source: tensorflow/models, research/efficient-hrl at 052361de. docs/algorithms/hiro.md lists what differs.
 """
 
+import dataclasses
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -47,9 +48,13 @@ EXPLORATION, TARGET_NOISE, TARGET_NOISE_CLIP = 1.0, 0.2, 0.5  # published, in th
 class HiroConfig:
     """The settings of HIRO."""
 
-    iterations: int = setting(1000, "iterations", ours="10 M steps, HIRO's own budget", low=1)
-    batch_size: int = setting(10_000, "environment steps per iteration, at least", low=1)
-    horizon: int = setting(1000, "steps per episode", low=1)
+    iterations: int = setting(dataclasses.MISSING, "training iterations", ours="HIRO's own 10 M steps", low=1)
+    batch_size: int = setting(
+        dataclasses.MISSING, "environment steps per iteration", ours="one horizon of a few environments", low=1
+    )
+    horizon: int = setting(
+        dataclasses.MISSING, "episode length H in steps", paper="Block 1000, Ant 5000, Snake 8000 (App. A)", low=1
+    )
     period: int = setting(10, "c, steps between two goals", code="10 (ant_maze.gin:27)", low=1)
     goal_space: str = setting(
         "body",
@@ -106,8 +111,10 @@ class HiroConfig:
         "skills file whose roll-outs the lower level is cloned from and both buffers start with; empty: from scratch",
         paper="fine-tunes the same given skills (Fig. 6), no recipe",
     )
-    cloning_steps: int = setting(20_000, "environment steps of the roll-outs of given skills, at least", low=1)
-    cloning_updates: int = setting(5000, "minibatches of behaviour cloning", low=1)
+    cloning_steps: int = setting(
+        20_000, "environment steps of the roll-outs of given skills, at least", ours="no recipe", low=1
+    )
+    cloning_updates: int = setting(5000, "minibatches of behaviour cloning", ours="25 passes over the roll-outs", low=1)
 
     def __post_init__(self) -> None:
         check(self)

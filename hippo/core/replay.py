@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -11,7 +12,8 @@ class Replay:
 
     def __init__(self, size: int, **shapes: tuple[int, ...]) -> None:
         self.size, self.added = size, 0  # added: rows ever, of which the newest `size` are kept
-        self.columns = {name: torch.empty(size, *shape) for name, shape in shapes.items()}
+        # numpy's: torch fills new memory, and so claims it, when algorithms are to be deterministic.
+        self.columns = {name: torch.from_numpy(np.empty((size, *shape), np.float32)) for name, shape in shapes.items()}
 
     def __len__(self) -> int:
         return min(self.added, self.size)
