@@ -73,11 +73,13 @@ def observe(x: np.ndarray, ahead: np.ndarray, heights: np.ndarray, track: Track)
 
     The previous wall is zeros before the first.
     """
-    out = np.zeros((len(x), 8))
+    out, rows = np.empty((len(x), 8)), np.arange(len(x))
     for column, index in ((0, ahead), (4, ahead - 1)):
-        centre = wall_x(index, track)
-        wall = np.stack([height_of(index, heights), np.full(len(x), LENGTH), centre, centre - x], -1)
-        out[:, column : column + 4] = np.where((index >= 0)[:, None], wall, 0.0)
+        out[:, column] = heights[rows, index % NUM_HEIGHTS]
+        out[:, column + 1] = LENGTH
+        out[:, column + 2] = centre = wall_x(index, track)
+        out[:, column + 3] = centre - x
+    out[ahead == 0, 4:] = 0.0
     return out
 
 
