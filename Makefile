@@ -37,6 +37,12 @@ all: $(FIGURES) $(TABLES)  ## every figure and table at SCALE
 report: install claims  ## one page with everything drawn at SCALE
 	@$(PY) analysis.report $(DRAW_FLAGS)
 
+skills-gallery: install  ## measure and draw the given skills, and a short video of each where OpenGL works
+	@$(PY) experiments.gallery paper_figures/data/skills/*.pt
+	@$(PY) paper_figures.gallery
+	@$(PY) experiments.gallery paper_figures/data/skills/*.pt --videos paper_figures/out/gallery || \
+		echo "no videos: 'make install-render' installs what drawing needs" >&2
+
 claims: install  ## the paper's comparative sentences and what the results at SCALE say about them
 	@$(PY) analysis.claims $(DRAW_FLAGS)
 
@@ -79,4 +85,4 @@ help:  ## this list
 	@echo "  make tableN      the same for: $(or $(TABLES),none yet)"
 	@echo "  make plan-figN   what it would train and cost, without training"
 
-.PHONY: install install-render all report claims lint test test-slow test-slurm smoke bench video clean help $(FIGURES) $(TABLES)
+.PHONY: install install-render all report skills-gallery claims lint test test-slow test-slurm smoke bench video clean help $(FIGURES) $(TABLES)

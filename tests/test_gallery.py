@@ -1,0 +1,115 @@
+"""The skills gallery: information against cases worked by hand, and from a skills file to a picture."""
+
+import math
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+
+from experiments import gallery
+from hippo.core.policies import SkillPolicy
+from hippo.core.skills import save_skills
+from hippo.envs import make
+from paper_figures import gallery as pictures
+
+
+def skills_file(path, num_skills=2):
+    envs = make("hopper", 1, 0)
+    policy = SkillPolicy(envs.robot_size, num_skills, 3, [8, 8], torch.Generator().manual_seed(3))
+    envs.close()
+    metadata = {"robot": "hopper", "observation": "paper", "env": "hopper", "algo": "diayn"}
+    save_skills(path, policy, metadata | {"run_id": "0123456789ab", "env_steps": 1, "physics": "paper"})
+    return policy
+
+
+def test_skills_that_never_share_a_cell_give_log_n_nat():
+    skill = np.arange(12) % 3
+    cell = np.stack([np.broadcast_to(skill, (5, 12)), np.zeros((5, 12), int)], -1)
+    assert gallery.information(cell, skill, 3) == pytest.approx(math.log(3))
+    assert gallery.permuted_information(cell, skill, 3, 0) < 0.5 * math.log(3)
+
+
+def test_identical_skills_on_paths_of_their_own_score_high_and_the_permutation_takes_it_away():
+    # Every path stays in a cell of its own, whatever its skill: the plug-in estimate is log n all the same.
+    skill = np.arange(60) % 6
+    cell = np.stack([np.broadcast_to(np.random.default_rng(0).permutation(60), (40, 60)), np.zeros((40, 60), int)], -1)
+    plug_in = gallery.information(cell, skill, 6)
+    assert plug_in == pytest.approx(math.log(6))
+    assert plug_in - gallery.permuted_information(cell, skill, 6, 0) == pytest.approx(0, abs=1e-9)
+
+
+def test_a_hand_worked_table_of_visits():
+    # Two skills of equal use; cell 0 holds 3 steps of z = 0 and 1 of z = 1, cell 1 the other way round.
+    cell = np.array([[[0, 0], [0, 0]], [[0, 0], [1, 0]], [[0, 0], [1, 0]], [[1, 0], [1, 0]]])
+    expected = math.log(2) + 0.75 * math.log(0.75) + 0.25 * math.log(0.25)
+    assert gallery.information(cell, np.array([0, 1]), 2) == pytest.approx(expected)
+
+
+def test_the_distance_of_action_distributions_worked_by_hand():
+    class TwoSkills:
+        num_skills = 2
+        first = type("First", (), {"inputs": 1})
+
+        def means(self, obs):
+            return torch.stack([torch.zeros(len(obs), 2), torch.tensor([3.0, 4.0]).expand(len(obs), 2)], 1)
+
+        def log_std(self):
+            return torch.tensor([[1.0, 1.0], [1.0, 13.0]]).log()
+
+    assert gallery.action_distance(TwoSkills(), torch.zeros(5, 3)) == pytest.approx(math.sqrt(25 + 144))
+
+
+def test_from_a_skills_file_to_a_picture_that_is_the_same_twice(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(gallery.STEPS, "diayn", 25)
+    path = tmp_path / "hopper.pt"
+    skills_file(path)
+    assert gallery.main([str(path), "--paths", "8"]) == 0
+    assert "hopper, trained skills: 8/8 paths" in capsys.readouterr().out
+    metrics = pd.read_csv(tmp_path / "hopper.metrics.csv")
+    assert set(metrics["group"]) == {"trained", "random"}
+    assert set(metrics["run_id"]) == {"0123456789ab"}
+    of_all = metrics[(metrics["group"] == "trained") & metrics["skill"].isna()].set_index("metric")["value"]
+    assert of_all["paths"] == 8
+    difference = of_all["information"] - of_all["information_permuted"]
+    assert of_all["information_corrected"] == pytest.approx(difference, abs=1e-5)
+    visits = pd.read_csv(tmp_path / "hopper.visits.csv")
+    assert visits.groupby("group")["steps"].sum().tolist() == [8 * 25, 8 * 25]
+    for out in ("a", "b"):
+        assert pictures.main(["--data", str(tmp_path), "--out", str(tmp_path / out)]) == 0
+    for name in ("hopper.png", "hopper.pdf", "hopper.caption.txt"):
+        assert (tmp_path / "a/gallery" / name).read_bytes() == (tmp_path / "b/gallery" / name).read_bytes()
+
+
+def test_what_is_measured_is_not_measured_again_but_for_other_skills_it_is(tmp_path, monkeypatch):
+    path = tmp_path / "hopper.pt"
+    skills_file(path)
+    studied = []
+
+    def study(*_):
+        studied.append(1)
+        return {"metrics": pd.DataFrame({"run_id": ["0123456789ab" if len(studied) == 1 else "other"]})}
+
+    monkeypatch.setattr(gallery, "study", study)
+    for _ in range(2):
+        assert gallery.main([str(path)]) == 0
+    assert len(studied) == 1
+    (tmp_path / "hopper.metrics.csv").write_text("run_id\nffffffffffff\n")
+    gallery.main([str(path)])
+    assert len(studied) == 2
+
+
+def test_bad_input_is_named_in_one_line(tmp_path, capsys):
+    path = tmp_path / "hopper.pt"
+    assert gallery.main([str(path)]) == 2
+    skills_file(path)
+    assert gallery.main([str(path), "--paths", "3"]) == 2
+    path.write_bytes(path.read_bytes()[:-9])
+    assert gallery.main([str(path)]) == 2
+    errors = capsys.readouterr().err.splitlines()
+    assert len(errors) == 3
+    assert "No such file" in errors[0]
+    assert "paths=3: must be at least 4, two for each of 2 skills" in errors[1]
+    assert "damaged" in errors[2]
+    assert pictures.main(["--data", str(tmp_path)]) == 2
+    assert "no measured skills" in capsys.readouterr().err
