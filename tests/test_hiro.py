@@ -215,6 +215,7 @@ def test_h5_there_are_ten_candidates_all_in_the_box_spread_by_half_of_its_half_r
     candidates = candidate_goals(goals, first, last, stored, generator())
     assert candidates.shape == (B, 10, 2)
     assert torch.equal(candidates[:, 0], stored)
+    assert not torch.equal(candidates[0, 2:], candidates[1, 2:]), "every decision of a batch has draws of its own"
     assert candidates[0, 1].tolist() == pytest.approx([0.2, 1.0])  # the change achieved, clipped to the box
     assert bool((candidates.abs() <= goals.half_range).all())
     wide = Goals(torch.tensor([0]), torch.tensor([100.0]))
