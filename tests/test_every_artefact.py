@@ -1,0 +1,90 @@
+"""Every figure, every table, the claims and the report, from runs that are really trained at a private, tiny scale."""
+
+import runpy
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from experiments import config, plan
+from experiments.train import execute
+
+ROOT = Path(__file__).parent.parent
+SCALE = "tiny"  # one seed, two iterations of two episodes
+TASKS = ("block_hopper", "block_half_cheetah", "snake_gather", "ant_gather", "ant", "snake", "hopper", "half_cheetah")
+YAML = """\
+# @package _global_
+scale: tiny
+seeds: 1
+off_policy: {iterations: 2, batch_size: 40}
+budget:
+"""
+FIGURES = sorted(path.stem for path in (config.CONF / "figure").glob("*.yaml"))
+ARTEFACTS = sorted(path.stem for stem in ("fig", "table") for path in (ROOT / "paper_figures").glob(f"{stem}[0-9]*.py"))
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    """A runs folder with all runs of all figures."""
+    folder = tmp_path_factory.mktemp("tiny")
+    conf = folder / "conf"
+    shutil.copytree(config.CONF, conf)
+    budgets = [f"  {task}: {{iterations: 2, batch_size: 40, horizon: 20, physics: fast}}\n" for task in TASKS]
+    paper = [line.replace("fast", "paper") if "hopper" in line or "cheetah" in line else line for line in budgets]
+    (conf / "scale" / f"{SCALE}.yaml").write_text(YAML + "".join(paper))
+    for path in (conf / "figure").glob("*.yaml"):  # what makes a figure quick at smoke scale makes it quick here
+        path.write_text(path.read_text().replace("smoke:", f"{SCALE}:"))
+    threads = torch.get_num_threads()
+    with pytest.MonkeyPatch.context() as patch:
+        for module in (config, plan):
+            patch.setattr(module, "CONF", conf)
+        config._base.cache_clear()
+        for figure in FIGURES:
+            todo = plan.make_plan(figure, SCALE, [], True, folder / "runs").todo()
+            states = {run.run_id: execute(run) for run in todo}
+            assert set(states.values()) <= {"finished"}, (figure, states)
+            plan.make_plan(figure, SCALE, [], True, folder / "runs").write(folder / "runs")
+    config._base.cache_clear()
+    torch.set_num_threads(threads)
+    torch.use_deterministic_algorithms(False)
+    return folder / "runs"
+
+
+def made(module, runs, out, monkeypatch):
+    """Run `python -m module` for the tiny scale in this process; its exit code."""
+    arguments = [module, "--scale", SCALE, "--runs-dir", str(runs), "--out", str(out)]
+    monkeypatch.setattr(sys, "argv", arguments)
+    with pytest.raises(SystemExit) as end:
+        runpy.run_module(module, run_name="__main__")
+    return end.value.code
+
+
+def test_nothing_is_drawn_that_has_no_configuration_and_nothing_configured_is_not_drawn():
+    trained_nothing = {"fig1", "fig2", "table3"}
+    assert set(ARTEFACTS) - trained_nothing == set(FIGURES)
+    assert {f"fig{i}" for i in range(1, 10)} | {f"table{i}" for i in range(1, 4)} == set(ARTEFACTS)
+
+
+@pytest.mark.parametrize("artefact", ARTEFACTS)
+def test_it_is_made_of_the_runs_of_its_plan(artefact, runs, tmp_path, monkeypatch, capsys):
+    assert made(f"paper_figures.{artefact}", runs, tmp_path, monkeypatch) == 0
+    assert "missing" not in capsys.readouterr().out
+    kinds = {"fig": (".png", ".pdf", ".caption.txt"), "table": (".tex", ".md", ".csv")}[artefact.rstrip("123456789")]
+    for kind in kinds:
+        assert (tmp_path / SCALE / f"{artefact}{kind}").stat().st_size > 100
+    if artefact.startswith("fig") and artefact in FIGURES:
+        first = [(tmp_path / SCALE / f"{artefact}{kind}").read_bytes() for kind in kinds]
+        assert made(f"paper_figures.{artefact}", runs, tmp_path, monkeypatch) == 0
+        assert [(tmp_path / SCALE / f"{artefact}{kind}").read_bytes() for kind in kinds] == first
+
+
+def test_one_seed_gives_no_verdict_and_all_of_it_fits_on_one_page(runs, tmp_path, monkeypatch, capsys):
+    assert made("paper_figures.fig3", runs, tmp_path, monkeypatch) == 0
+    assert made("analysis.claims", runs, tmp_path, monkeypatch) == 0
+    said = capsys.readouterr().out
+    assert "inconclusive at this budget" in said
+    assert "| reproduced |" not in said
+    assert made("analysis.report", runs, tmp_path, monkeypatch) == 0
+    assert (tmp_path / SCALE / "report.html").stat().st_size > 10_000
