@@ -55,7 +55,7 @@ lint: install  ## ruff (format and rules) and mypy
 	$(BIN)/mypy
 
 test: install  ## every test but the slow ones
-	$(PY) pytest -m "not slow and not slurm"
+	$(PY) pytest -m "not slow and not slurm and not browser"
 
 test-slow: install  ## the tests that take minutes
 	$(PY) pytest -m slow -s
@@ -63,6 +63,10 @@ test-slow: install  ## the tests that take minutes
 test-slurm: install  ## the launcher on a real one-node Slurm, installed by apt (as root) where it is missing
 	@$(PY) tests.slurm.cluster install || echo "no Slurm here and none to be installed: its tests are skipped" >&2
 	$(PY) pytest -m slurm tests/slurm
+
+test-report: install  ## the report in a real browser, Debian's Chromium, installed by apt (as root) where it is missing
+	@$(PY) tests.report.browser install || echo "no Chromium here and none to be installed: its tests are skipped" >&2
+	$(PY) pytest -m browser tests/report
 
 smoke: fig3  ## train and draw Figure 3 at smoke scale
 
@@ -85,4 +89,4 @@ help:  ## this list
 	@echo "  make tableN      the same for: $(or $(TABLES),none yet)"
 	@echo "  make plan-figN   what it would train and cost, without training"
 
-.PHONY: install install-render all report skills-gallery claims lint test test-slow test-slurm smoke bench video clean help $(FIGURES) $(TABLES)
+.PHONY: install install-render all report skills-gallery claims lint test test-slow test-slurm test-report smoke bench video clean help $(FIGURES) $(TABLES)

@@ -26,6 +26,7 @@ GATHER = ("snake_gather", "ant_gather")
 CHANGES = ("mass", "damping", "inertia", "friction")
 ALPHA = 0.05
 FEWEST_SEEDS = 3
+PIPE = r"\|"  # a pipe within a Markdown table's cell
 ALMOST_ONE = 0.9  # what "almost 1" is taken to mean; the paper's own cells are 0.94 to 0.98
 ORDER_OF_A_TENTH = (10**-1.5, 10**-0.5)
 REPRODUCED, NOT_REPRODUCED, INCONCLUSIVE = "reproduced", "not reproduced", "inconclusive at this budget"
@@ -398,7 +399,8 @@ def lines(scale: str, runs_dir: Path, data_dir: Path) -> list[str]:
         own = "" if claim.printed is None else "holds in {} of {}".format(*claim.printed(paper))
         if claim.printed is not None and claim.needed is not None:
             own += f" ({claim.needed} needed)"
-        out.append(f"| {claim.name} | {claim.source} | {claim.sentence} | {ruling} | {shown} | {own} |")
+        cells = (claim.name, claim.source, claim.sentence, ruling, shown, own)
+        out.append(f"| {' | '.join(cell.replace('|', PIPE) for cell in cells)} |")
     measured_coverage = "; ".join(
         f"n = {n}: {coverage(n, False):.3f} normal, {coverage(n, True):.3f} log-normal" for n in (3, 5, 10)
     )

@@ -1,78 +1,211 @@
-"""One self-contained page with everything drawn at one scale: `python -m analysis.report --scale smoke`.
+"""Everything at one scale on one page: `python -m analysis.report --scale smoke` writes report.html and report.md.
 
-Pictures are embedded, nothing is loaded from elsewhere, and every text is escaped.
+The page carries its pictures, loads nothing and runs no script; every text is escaped, whatever a run is called.
 """
 
 import argparse
 import base64
-import csv
-import json
+import os
+import re
 import sys
+from collections import Counter
 from collections.abc import Sequence
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
-from jinja2 import Environment
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markupsafe import Markup, escape
+
+from analysis.report_data import ROOT, Artefact, Report, RunFacts, Table, gather
+from analysis.runs import MissingData
 
 HERE = Path(__file__).parent
-ROOT = HERE.parent
+RUN_COLUMNS = ("run", "algorithm", "method", "seed", "state", "commit", "lock", "core-s", "physics", "used in")
+VERDICTS = {"reproduced": "good", "not reproduced": "bad", "inconclusive at this budget": "open"}
+UNKNOWN = "-"
+MARKUP = re.compile(r"([\\`*_\[\]|~$@]|:(?=//)|(?<=www)\.)")  # the last three make links of bare addresses
+OPENING = re.compile(r"^(\d*)(?=[-+#=.)]+(\s|$))")  # of a line, which makes it a list, a heading or a rule
 
 
-def markdown_table(text: str) -> list[list[str]]:
-    """The cells of the first Markdown table in `text`, header first."""
-    lines = [line.strip().strip("|") for line in text.splitlines() if line.startswith("|")]
-    return [[cell.strip() for cell in line.split("|")] for i, line in enumerate(lines) if i != 1]
+class Plain(str):
+    """Text that is Markdown already."""
 
 
-def artefact(plan: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """What is there of one figure or table."""
-    stem = folder / plan["figure"]
-    png, caption, table = stem.with_suffix(".png"), stem.with_suffix(".caption.txt"), stem.with_suffix(".md")
-    return {
-        "name": plan["figure"],
-        "title": plan["title"],
-        "png": base64.b64encode(png.read_bytes()).decode() if png.exists() else "",
-        "rows": markdown_table(table.read_text()) if table.exists() else [],
-        "caption": caption.read_text() if caption.exists() else "",
-        "claims": plan["claims"],
-        "runs": plan["runs"],
+def markdown_text(value: Any) -> str:
+    """`value` as Markdown shows it letter by letter, on one line: nothing in it is markup, HTML or a link."""
+    if isinstance(value, Plain | Markup):
+        return str(value)
+    return OPENING.sub(r"\1\\", _within_a_line(str(value)).strip())
+
+
+def markdown_bold(cell: str) -> str:
+    """A table's cell, what stands between ** in bold."""
+    parts = map(_within_a_line, split_bold(cell))
+    return "".join(f"**{part}**" if i % 2 else part for i, part in enumerate(parts)).strip()
+
+
+def _within_a_line(text: str) -> str:
+    """`text` as Markdown shows it where no line begins."""
+    text = MARKUP.sub(r"\\\1", re.sub(r"\s+", " ", text))
+    return text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
+
+
+def markdown_grid(table: Table) -> Plain:
+    """A table as Markdown."""
+    rule = "|".join(" ---: " if numeric else " --- " for numeric in table.numeric())
+    rows = [" | ".join(map(markdown_bold, cells)) for cells in (table.header, *table.rows)]
+    return Plain("\n".join([f"| {rows[0]} |", f"|{rule}|", *(f"| {row} |" for row in rows[1:])]) + "\n")
+
+
+def html_bold(cell: str) -> Markup:
+    """The same as HTML."""
+    return Markup("").join(
+        Markup("<strong>{}</strong>").format(part) if i % 2 else escape(part) for i, part in enumerate(split_bold(cell))
+    )
+
+
+def split_bold(cell: str) -> list[str]:
+    """Parts of a cell, every second one bold; a cell with an unpaired ** is one part."""
+    parts = re.split(r"(?:(?<=^)|(?<=\s))\*\*(?=\S)|(?<=\S)\*\*(?=\s|$)", cell)
+    return parts if len(parts) % 2 else [cell]
+
+
+def data_uri(path: Path, kind: str) -> str:
+    """A file as an address that carries it."""
+    return f"data:{kind};base64,{base64.b64encode(path.read_bytes()).decode()}"
+
+
+def duration(seconds: float) -> str:
+    """A cost in a larger unit, with a comma; empty where seconds say it as well."""
+    for size, unit in ((3600, "core-hours"), (60, "core-minutes")):
+        if seconds >= size:
+            return f"{seconds / size:,.1f} {unit}, "
+    return ""
+
+
+def full_name(name: str) -> str:
+    """ "fig3" as "Figure 3", anything else as words."""
+    found = re.fullmatch(r"(fig|table)(\d+)", name)
+    return f"{ {'fig': 'Figure', 'table': 'Table'}[found[1]] } {found[2]}" if found else words(name)
+
+
+def words(name: str) -> str:
+    """ "ant_gather" as "Ant Gather"."""
+    return name.replace("_", " ").title()
+
+
+def anchor(name: str) -> str:
+    """An id that no name can break out of, different from those of the fixed sections."""
+    return "artefact-" + re.sub(r"[^a-z0-9]", lambda found: f"-{ord(found[0]):x}", name)
+
+
+def behind(artefact: Artefact) -> str:
+    """Which runs an artefact states, beside those that are planned."""
+    if not artefact.behind and not artefact.planned:
+        return "No run stands behind it."
+    drawn = f"Drawn from {len(artefact.behind)} run{'' if len(artefact.behind) == 1 else 's'}"
+    if artefact.behind == artefact.planned:
+        return f"{drawn}, all that are planned."
+    known, unknown = len(artefact.behind & artefact.planned), len(artefact.behind - artefact.planned)
+    others = f", and {unknown} that the list of runs on this page lacks" if unknown else ""
+    return f"{drawn}: {known} of the {len(artefact.planned)} that are planned{others}."
+
+
+def run_row(run: RunFacts) -> list[str]:
+    """One run under RUN_COLUMNS."""
+    commit = {None: UNKNOWN, True: f"{run.commit[:10]} + changes", False: run.commit[:10] or UNKNOWN}[run.dirty]
+    cost = UNKNOWN if run.seconds is None else f"{run.seconds:,.0f}"
+    method = ", ".join(run.labels) or "others start from it"
+    known = (run.run_id, run.algo, method, run.seed, run.state, commit, run.lock[:10], cost, run.physics)
+    return [text or UNKNOWN for text in (*known, ", ".join(run.used_in))]
+
+
+def runs_by_environment(runs: Sequence[RunFacts]) -> dict[str, Table]:
+    """A table of runs per environment."""
+    tables: dict[str, Table] = {}
+    for run in runs:
+        tables.setdefault(run.env or "unknown here", Table(list(RUN_COLUMNS), [])).rows.append(run_row(run))
+    return tables
+
+
+def code_table(runs: Sequence[RunFacts]) -> Table:
+    """Which code, versions and processors the runs were trained with, and how many runs each."""
+    groups = Counter((run.commit, run.dirty, run.lock, run.cpu) for run in runs if run.dirty is not None)
+    return Table(
+        ["commit", "uncommitted changes", "lock file (SHA-256)", "processor", "runs"],
+        [[c or UNKNOWN, "yes" if d else "no", k[:16] or UNKNOWN, p, str(n)] for (c, d, k, p), n in groups.items()],
+    )
+
+
+def ledger_by_algorithm(ledger: Table) -> dict[str, Table]:
+    """The ledger, a table per algorithm."""
+    tables: dict[str, Table] = {}
+    for algorithm, *cells in ledger.rows:
+        tables.setdefault(algorithm, Table(ledger.header[1:], [])).rows.append(cells)
+    return tables
+
+
+def render(report: Report) -> tuple[str, str]:
+    """The page as HTML, and as Markdown."""
+    style = (HERE / "report.css").read_text()
+    digest = base64.b64encode(sha256(style.encode()).digest()).decode()
+    content = {
+        "report": report,
+        "css": Markup(style),  # ours, and the policy lets this very text in
+        "policy": f"default-src 'none'; style-src 'sha256-{digest}'; img-src data:; media-src data:; "
+        "base-uri 'none'; form-action 'none'",
+        "claims": [dict(zip(report.claims.header, row, strict=True)) for row in report.claims.rows]
+        if report.claims
+        else [],
+        "runs": runs_by_environment(report.runs),
+        "code": code_table(report.runs),
+        "ledger": ledger_by_algorithm(report.ledger),
+        "timed": sum(run.seconds is not None for run in report.runs),
     }
-
-
-def render(scale: str, runs_dir: Path, out: Path) -> str:
-    """The page as HTML.
-
-    Raises:
-        FileNotFoundError: nothing was planned at this scale.
-    """
-    plans = [json.loads(path.read_text()) for path in sorted((runs_dir / "plans" / scale).glob("*.json"))]
-    if not plans:
-        raise FileNotFoundError(f"nothing was run at scale {scale} in {runs_dir}; run `make all SCALE={scale}` first")
-    with (ROOT / "docs" / "hyperparameters.csv").open() as file:
-        ledger = list(csv.reader(file))
-    artefacts = [artefact(plan, out / scale) for plan in plans]
-    template = Environment(autoescape=True).from_string((HERE / "report.html.j2").read_text())
-    claims = out / scale / "claims.md"
-    rows = markdown_table(claims.read_text()) if claims.exists() else []
-    return template.render(scale=scale, artefacts=artefacts, ledger=ledger, claims=rows)
+    options: dict[str, Any] = {
+        "loader": FileSystemLoader(HERE),
+        "undefined": StrictUndefined,
+        "trim_blocks": True,
+        "lstrip_blocks": True,
+        "keep_trailing_newline": True,
+    }
+    both: dict[str, Any] = {"behind": behind, "duration": duration, "name": full_name}
+    html = Environment(autoescape=True, **options)
+    html.filters |= both | {"anchor": anchor, "bold": html_bold, "data_uri": data_uri, "words": words}
+    html.filters["verdict_class"] = lambda verdict: VERDICTS.get(verdict, "")
+    markdown = Environment(autoescape=False, finalize=markdown_text, **options)
+    markdown.filters |= both | {"plain": Plain, "link": quote, "grid": markdown_grid, "html": escape}
+    return (
+        html.get_template("report.html.j2").render(content).lstrip(),
+        re.sub(r"\n{3,}", "\n\n", markdown.get_template("report.md.j2").render(content)).strip() + "\n",
+    )
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Write report.html."""
+    """Write report.html and report.md; exit code 2 where there is nothing to report."""
     parser = argparse.ArgumentParser(prog="analysis.report", description=__doc__.splitlines()[0])
     parser.add_argument("--scale", default="smoke", help="smoke, laptop or paper")
     parser.add_argument("--runs-dir", type=Path, default=Path("runs"))
+    parser.add_argument("--data", type=Path, default=ROOT / "paper_figures" / "data", help="committed results")
     parser.add_argument("--out", type=Path, default=ROOT / "paper_figures" / "out")
     options = parser.parse_args(arguments)
     try:
-        page = render(options.scale, options.runs_dir, options.out)
-    except FileNotFoundError as error:
+        report = gather(options.scale, options.runs_dir, options.data, options.out)
+        pages = render(report)
+    except (MissingData, ValueError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    path = options.out / options.scale / "report.html"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(page)
-    print(f"wrote {path}")
+    folder = options.out / options.scale
+    folder.mkdir(parents=True, exist_ok=True)
+    for line in report.not_drawn:
+        print(f"missing: {line}")
+    for name, page in zip(("report.html", "report.md"), pages, strict=True):
+        temporary = folder / f"{name}.tmp"
+        temporary.write_text(page)
+        os.replace(temporary, folder / name)
+    print(f"wrote {folder / 'report.html'} ({len(pages[0]) / 1e6:.1f} MB) and {folder / 'report.md'}")
     return 0
 
 

@@ -1,0 +1,361 @@
+"""What the report says of one scale, gathered from files alone: what was drawn, the runs behind it, claims, files."""
+
+import csv
+import json
+import re
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from PIL import Image
+
+from analysis import explain
+from analysis.runs import MissingData
+
+ROOT = Path(__file__).parent.parent
+LEDGER = ROOT / "docs" / "hyperparameters.csv"
+OWN_FILES = ("claims", "report")  # Markdown files of a scale's folder that are no tables
+VIDEOS = {".mp4": "video/mp4", ".gif": "image/gif"}
+THERE = ("finished", "committed")
+NOT_HERE = "not trained here"  # a run that others start from; committed skills may stand in for it
+
+
+@dataclass(frozen=True)
+class Table:
+    """A header and rows of cells; what stands between ** in a cell is bold."""
+
+    header: list[str]
+    rows: list[list[str]]
+
+    def numeric(self) -> list[bool]:
+        """Per column, whether each cell that is not empty opens with a number, other words only after a space."""
+        number = re.compile(r"(\*\*)?[-+]?[\d,]*\.?\d+(e[-+]?\d+)?($|[ *])")
+        columns = [[row[i] for row in self.rows if i < len(row) and row[i]] for i in range(len(self.header))]
+        return [bool(cells) and all(number.match(cell) for cell in cells) for cells in columns]
+
+
+@dataclass
+class RunFacts:
+    """One run of this scale: what it is, how it is doing, where it came from, what it cost."""
+
+    run_id: str
+    algo: str = ""
+    env: str = ""
+    labels: list[str] = field(default_factory=list)  # what figures call it
+    seed: str = ""
+    physics: str = ""
+    state: str = "missing"
+    used_in: list[str] = field(default_factory=list)
+    commit: str = ""
+    dirty: bool | None = None  # None: no manifest here
+    lock: str = ""
+    cpu: str = ""
+    seconds: float | None = None  # core-seconds, a run has one thread; None: it has no clocks here
+    videos: list[Path] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Artefact:
+    """One figure or table that was drawn."""
+
+    name: str
+    title: str
+    picture: Path | None
+    size: tuple[int, int]  # of the picture, in pixels
+    caption: list[str]
+    table: Table | None
+    files: list[str]  # what lies beside the page
+    claims: list[str]
+    notes: list[str]
+    behind: set[str]  # ids of the runs that the files themselves state
+    planned: set[str]
+    absent: list[str]  # planned runs that are not there, in words
+
+
+@dataclass(frozen=True)
+class Report:
+    """Everything on the page."""
+
+    scale: str
+    artefacts: list[Artefact]
+    not_drawn: list[str]
+    runs: list[RunFacts]
+    origin: Table  # per figure or table: runs committed, trained here, not there
+    committed_files: Table
+    claims: Table | None
+    claims_notes: list[str]
+    ledger: Table
+    frames: list[Path]
+
+    @property
+    def seconds(self) -> float:
+        """Core-seconds spent on the runs whose clocks are here."""
+        return sum(run.seconds for run in self.runs if run.seconds is not None)
+
+    @property
+    def states(self) -> dict[str, int]:
+        """Number of runs per state, most first."""
+        return dict(Counter(run.state for run in self.runs).most_common())
+
+    @property
+    def verdicts(self) -> dict[str, int]:
+        """Number of claims per verdict, most first."""
+        if self.claims is None:
+            return {}
+        place = self.claims.header.index("verdict")
+        return dict(Counter(row[place] for row in self.claims.rows).most_common())
+
+    @property
+    def videos(self) -> list[tuple[RunFacts, Path]]:
+        """Every video of a run."""
+        return [(run, path) for run in self.runs for path in run.videos]
+
+
+def natural(name: str) -> tuple[bool, str, int, str]:
+    """Sorting key: fig2 before fig10, figures before tables, both before anything else."""
+    found = re.fullmatch(r"(fig|table)(\d+)", name)
+    return (False, found[1], int(found[2]), "") if found else (True, "", 0, name)
+
+
+def markdown_table(text: str) -> Table | None:
+    r"""The first Markdown table in `text`, None where there is none; \| within a cell is a pipe.
+
+    Raises:
+        ValueError: a row has not as many cells as the header.
+    """
+    lines = [line.strip() for line in text.splitlines() if line.startswith("|")]
+    if not lines:
+        return None
+    cut = [re.split(r"(?<!\\)\|", line.removeprefix("|").removesuffix("|")) for line in lines]
+    header, _, *rows = [[cell.strip().replace(r"\|", "|") for cell in row] for row in cut]
+    if any(len(row) != len(header) for row in rows):
+        raise ValueError(f"a table of {len(header)} columns ({', '.join(header)}) has a row of another length")
+    return Table(header, rows)
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """An object in JSON.
+
+    Raises:
+        ValueError: it is none, with the file's name.
+    """
+    try:
+        content = json.loads(path.read_text())
+    except ValueError as error:
+        raise ValueError(f"{path}: is no JSON ({error})") from error
+    if not isinstance(content, dict):
+        raise ValueError(f"{path}: must hold a JSON object")
+    return content
+
+
+def read_plans(folder: Path) -> dict[str, dict[str, Any]]:
+    """Plans by figure.
+
+    Raises:
+        ValueError: one lacks what a plan has.
+    """
+    plans = {}
+    for path in sorted(folder.glob("*.json"), key=lambda path: natural(path.stem)):
+        plan = read_json(path)
+        missing = {"figure", "scale", "title", "runs"} - set(plan)
+        if missing:
+            raise ValueError(f"{path}: is no plan, it lacks {', '.join(sorted(missing))}")
+        if plan["scale"] != folder.name:
+            raise ValueError(f"{path}: is a plan of scale {plan['scale']}, not of {folder.name}")
+        plans[path.stem] = plan
+    return plans
+
+
+def core_seconds(path: Path) -> float | None:
+    """Sum of timing.csv's seconds, None without the file; a last line torn by a kill does not count."""
+    if not path.exists():
+        return None
+    text = path.read_text()
+    return sum(float(row["seconds"]) for row in csv.DictReader(text[: text.rfind("\n") + 1].splitlines()))
+
+
+def read_folder(facts: RunFacts, runs_dir: Path) -> None:
+    """Add what the run's folder says; without a folder nothing is added."""
+    folder = runs_dir / facts.run_id
+    if folder.name != facts.run_id or not folder.is_dir():  # an id with a slash in it is no folder of runs_dir
+        return
+    if facts.state != "committed" and (folder / "status.json").exists():
+        facts.state = str(read_json(folder / "status.json").get("state", "unknown"))
+    if (folder / "manifest.json").exists():
+        content = read_json(folder / "manifest.json")
+        identity = content.get("identity", {})
+        facts.algo = str(identity.get("algo", ""))
+        facts.env, facts.seed = facts.env or str(identity.get("env", "")), facts.seed or str(identity.get("seed", ""))
+        facts.commit, facts.lock = str(content.get("git_commit") or ""), str(content.get("lock") or "")
+        facts.dirty, facts.cpu = bool(content.get("git_difference")), str(content.get("cpu") or "")
+    facts.seconds = core_seconds(folder / "timing.csv")
+    facts.videos = sorted(path for path in folder.iterdir() if path.suffix in VIDEOS)
+
+
+def read_runs(plans: dict[str, dict[str, Any]], runs_dir: Path) -> list[RunFacts]:
+    """Each planned run once, in the plans' order, with the runs whose skills or policies it starts from before it."""
+    runs: dict[str, RunFacts] = {}
+    for figure, plan in plans.items():
+        for planned in plan["runs"]:
+            for ancestor in planned.get("ancestors", []):
+                facts = runs.setdefault(str(ancestor), RunFacts(str(ancestor), state=NOT_HERE))
+                facts.used_in += [figure] if figure not in facts.used_in else []
+            facts = runs.setdefault(str(planned["run_id"]), RunFacts(str(planned["run_id"])))
+            label = str(planned.get("variant_label", ""))
+            facts.labels += [label] if label not in facts.labels else []
+            facts.used_in += [figure] if figure not in facts.used_in else []
+            facts.env, facts.seed = str(planned.get("env_label", "")), str(planned.get("seed", ""))
+            facts.physics = str(planned.get("physics", ""))
+            # A run that one figure takes from the committed rows may be trained for another.
+            facts.state = facts.state if facts.state == "committed" else str(planned.get("state", "missing"))
+    for facts in runs.values():
+        read_folder(facts, runs_dir)
+    return list(runs.values())
+
+
+def absent(plan: dict[str, Any], states: dict[str, str]) -> list[str]:
+    """Planned runs that are not there, a line per environment, method and state."""
+    groups: dict[tuple[str, str, str], list[str]] = {}
+    for run in plan["runs"]:
+        if (state := states[str(run["run_id"])]) not in THERE:
+            key = (str(run.get("env_label", "")), str(run.get("variant_label", "")), state)
+            groups.setdefault(key, []).append(str(run.get("seed", "")))
+    return [f"{env}, {label}, seed {', '.join(seeds)}: {state}" for (env, label, state), seeds in groups.items()]
+
+
+def read_artefact(name: str, folder: Path, plan: dict[str, Any] | None, states: dict[str, str]) -> Artefact:
+    """What lies in `folder` of one figure or table.
+
+    Raises:
+        ValueError: its picture is none, or its table has rows of different lengths.
+    """
+    picture, caption, table = (folder / f"{name}{suffix}" for suffix in (".png", ".caption.txt", ".md"))
+    files = sorted(path for path in folder.glob(f"{name}.*") if path.suffix in (".csv", ".pdf", ".png", ".tex", ".md"))
+    title, size, lines, cells = name, (0, 0), [], None
+    if table.exists():
+        text = table.read_text()
+        try:
+            cells = markdown_table(text)
+        except ValueError as error:
+            raise ValueError(f"{table}: {error}") from error
+        lines = [line for line in text.splitlines() if line and not line.startswith("|")]
+        title = lines[0].split(". ")[0] if lines else name
+    if picture.exists():
+        try:
+            with Image.open(picture) as image:
+                size, title = image.size, str(image.info.get("Title", title)).removeprefix(f"{name}: ")
+        except OSError as error:
+            raise ValueError(f"{picture}: is no picture ({error}); draw it again") from error
+    if caption.exists():
+        lines = [line for line in caption.read_text().splitlines() if line]
+    plan = plan or {"title": title, "runs": []}
+    behind: set[str] = set()
+    for path in files:
+        if path.suffix in (".pdf", ".png", ".tex"):
+            try:
+                behind |= set(explain.run_ids(path))
+            except ValueError:  # a figure that nothing was trained for states no runs, which is not an error here
+                continue
+    return Artefact(
+        name=name,
+        title=str(plan["title"]),
+        picture=picture if picture.exists() else None,
+        size=size,
+        caption=lines,
+        table=cells,
+        files=[path.name for path in files],
+        claims=[str(claim) for claim in plan.get("claims", [])],
+        notes=[str(note) for note in plan.get("notes", [])],
+        behind=behind,
+        planned={str(run["run_id"]) for run in plan["runs"]},
+        absent=absent(plan, states),
+    )
+
+
+def drawn_names(folder: Path) -> list[str]:
+    """Figures and tables in a scale's folder, in the paper's order."""
+    names = {path.stem for path in (*folder.glob("*.png"), *folder.glob("*.md"))} - set(OWN_FILES)
+    return sorted(names, key=natural)
+
+
+def not_drawn(scale: str, drawn: Iterable[str], plans: dict[str, dict[str, Any]]) -> list[str]:
+    """A line per figure and table of the suite, or of a plan, that is not on the page."""
+    scripts = (ROOT / "paper_figures").glob("*.py")
+    suite = {path.stem for path in scripts if re.fullmatch(r"(fig|table)\d+", path.stem)}
+    lines = []
+    for name in sorted((suite | set(plans)) - set(drawn), key=natural):
+        if name in plans and not plans[name]["runs"]:
+            lines.append(f"{name}: nothing is trained for it at scale {scale}")
+        else:
+            lines.append(f"{name}: not drawn; make {name} SCALE={scale}")
+    return lines
+
+
+def origin(plans: dict[str, dict[str, Any]], states: dict[str, str]) -> Table:
+    """Per figure or table, how many of its runs are committed, trained here, or not there."""
+    rows = []
+    for name, plan in plans.items():
+        found = [states[run_id] for run_id in {str(run["run_id"]) for run in plan["runs"]}]
+        counts = [len(found), found.count("committed"), found.count("finished"), sum(s not in THERE for s in found)]
+        rows.append([name, *map(str, counts)])
+    return Table(["artefact", "runs", "committed results", "trained here", "not there"], rows)
+
+
+def committed_files(scale: str, data: Path) -> Table:
+    """What of paper_figures/data stands behind this scale: results, skills and frames."""
+    groups = (("results", data / scale), ("skills", data / "skills"), ("frames", data / "frames"))
+    rows = []
+    for what, folder in groups:
+        if files := sorted(path for path in folder.glob("*") if path.is_file()):
+            size = sum(path.stat().st_size for path in files)
+            names = ", ".join(path.name for path in files)
+            rows.append([what, f"{folder.name}/", str(len(files)), f"{size / 1000:,.0f} kB", names])
+    return Table(["what", "folder", "files", "size", "names"], rows)
+
+
+def read_table_csv(path: Path) -> Table:
+    """A csv as a table."""
+    with path.open(newline="") as file:
+        header, *rows = csv.reader(file)
+    return Table(header, rows)
+
+
+def scales(runs_dir: Path, out: Path) -> list[str]:
+    """Scales at which something was planned or drawn."""
+    folders = {path.parent for path in (runs_dir / "plans").glob("*/*.json")}
+    return sorted({path.name for path in (*folders, *(path for path in out.glob("*") if drawn_names(path)))})
+
+
+def gather(scale: str, runs_dir: Path, data: Path, out: Path) -> Report:
+    """Everything there is at one scale.
+
+    Raises:
+        MissingData: nothing was drawn and nothing planned.
+        ValueError: a file is damaged; the message names it.
+    """
+    folder = out / scale
+    plans, names = read_plans(runs_dir / "plans" / scale), drawn_names(folder)
+    if not plans and not names:
+        known = ", ".join(scales(runs_dir, out)) or "none"
+        raise MissingData(
+            f"scale={scale}: nothing was drawn or planned (scales that have something: {known}); "
+            f"run `make all SCALE={scale}`"
+        )
+    runs = read_runs(plans, runs_dir)
+    states = {run.run_id: run.state for run in runs}
+    claims = folder / "claims.md"
+    text = claims.read_text() if claims.exists() else ""
+    return Report(
+        scale=scale,
+        artefacts=[read_artefact(name, folder, plans.get(name), states) for name in names],
+        not_drawn=not_drawn(scale, names, plans),
+        runs=runs,
+        origin=origin(plans, states),
+        committed_files=committed_files(scale, data),
+        claims=markdown_table(text),
+        claims_notes=[line for line in text.splitlines() if line and not line.startswith("|")],
+        ledger=read_table_csv(LEDGER),
+        frames=sorted((data / "frames").glob("*.png")),
+    )
