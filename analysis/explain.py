@@ -8,11 +8,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-STATED = re.compile(rb"(?:(\d+) runs, set [0-9a-f]{12}|runs): ((?:[0-9a-f]{12} ?)+)")
+STATED = re.compile(rb"(\d+) runs, set [0-9a-f]{12}: ((?:[0-9a-f]{12} ?)+)")
 
 
 def run_ids(path: Path) -> list[str]:
-    """Ids that a PDF's or PNG's metadata, a LaTeX table's first line or a csv's run_id column states.
+    """Ids that a PDF's, SVG's or PNG's metadata, a LaTeX table's first line or a csv's run_id column states.
 
     Raises:
         ValueError: the file does not exist, or states no run.
@@ -26,10 +26,10 @@ def run_ids(path: Path) -> list[str]:
     else:
         found = STATED.search(path.read_bytes())
         ids = found[2].decode().split() if found else []
-        if found and found[1]:
+        if found:
             ids = ids[: int(found[1])]  # whatever bytes follow in the file are no run
     if not ids:
-        raise ValueError(f"{path}: states no runs; figures as .pdf or .png, tables as .tex, both as .csv do")
+        raise ValueError(f"{path}: states no runs; figures as .pdf, .svg or .png, tables as .tex, both as .csv do")
     return ids
 
 

@@ -3,10 +3,11 @@
 What belongs to a figure stands in its plan, `<runs_dir>/plans/<scale>/<figure>.json`, which experiments.sweep writes.
 """
 
+import hashlib
 import io
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,14 @@ class Results:
     plan: dict[str, Any]
     frame: pd.DataFrame  # COLUMNS
     missing: list[dict[str, Any]]  # planned runs without a single row, or cut short, as they stand in the plan
+    commits: list[str] = field(default_factory=list)  # at which the runs whose folders are here were trained
+
+    def provenance(self) -> str:
+        """The runs behind the data and the commits they were trained at, as one line."""
+        ids = sorted(set(self.frame["run_id"]))
+        digest = hashlib.sha256(" ".join(ids).encode()).hexdigest()[:12]
+        commits = " ".join(commit[:10] or "unknown" for commit in self.commits) or "those of the committed results"
+        return f"{len(ids)} runs, set {digest}: {' '.join(ids)}; commits: {commits}"
 
     def missing_lines(self) -> list[str]:
         """`missing` in words, a line per environment, variant and state."""
@@ -80,7 +89,13 @@ def load(
     frame = pd.concat(parts, ignore_index=True)[COLUMNS] if parts else pd.DataFrame(columns=COLUMNS)
     if frame.empty:
         raise MissingData(f"{figure}: none of its {len(plan['runs'])} runs at scale {scale} has a result yet")
-    return Results(plan, frame, missing)
+    return Results(plan, frame, missing, read_commits(runs_dir, sorted(set(frame["run_id"]))))
+
+
+def read_commits(runs_dir: Path, ids: Sequence[str]) -> list[str]:
+    """The commits that the manifests of runs state, each once; runs without a folder here state none."""
+    manifests = [runs_dir / run_id / "manifest.json" for run_id in ids]
+    return sorted({json.loads(path.read_text())["git_commit"] or "" for path in manifests if path.exists()})
 
 
 def read_progress(path: Path, metrics: Sequence[str] | None) -> pd.DataFrame:

@@ -1,6 +1,5 @@
 """Learning curves: a panel per environment, a line per method, every seed visible; shared by figures 3 to 9."""
 
-import hashlib
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -18,6 +17,7 @@ from analysis import stats
 from analysis.runs import MissingData, Results, load, scores
 from paper_figures import command_line, style
 
+SHORTER = 0.95  # methods whose budget is below this share of the longest have their last value held
 NOT_A_RESULT = {"smoke": "smoke"}  # scales whose pictures say nothing about the methods
 
 
@@ -29,6 +29,8 @@ def unique(results: Results, key: str) -> dict[str, str]:
 def draw_panel(axes: Axes, results: Results, env: str, unit: float) -> dict[str, int]:
     """Draw all methods of one environment; returns the number of seeds behind each."""
     variants, seeds_drawn = unique(results, "variant"), {}
+    budget = budgets(results, env)
+    end = max(budget.values(), default=0.0) / unit
     for place, variant in enumerate(variants):
         seeds, steps, table = scores(results.frame, env, variant)
         if not seeds:
@@ -44,8 +46,17 @@ def draw_panel(axes: Axes, results: Results, env: str, unit: float) -> dict[str,
         interval = stats.bootstrap_mean(values[:, complete])
         axes.plot(x[complete], interval.point, color=color, marker=marker, zorder=above)
         axes.fill_between(x[complete], interval.low, interval.high, color=color, alpha=0.15, linewidth=0)
+        if budget[variant] / unit < SHORTER * end and complete.any():  # planned to end before the others
+            last = x[complete][-1], interval.point[-1]
+            axes.plot((last[0], end), (last[1],) * 2, color=color, linestyle=(0, (3, 2)), linewidth=0.9, zorder=above)
         seeds_drawn[variant] = len(seeds)
     return seeds_drawn
+
+
+def budgets(results: Results, env: str) -> dict[str, float]:
+    """Planned environment steps of every variant in one environment."""
+    runs = [run for run in results.plan["runs"] if run["env"] == env and run["kind"] == "train"]
+    return {run["variant"]: float(run["iterations"] * run["batch_size"]) for run in runs}
 
 
 def write_seeds(axes: Axes, seeds: dict[str, int], variants: list[str]) -> None:
@@ -93,6 +104,9 @@ def caption(results: Results, seeds: dict[str, dict[str, int]]) -> str:
         "pointwise. With fewer than about ten seeds it covers less than it says and decides nothing.",
         f"Simulated with {physics}.",
     ]
+    steps = [budgets(results, env) for env in unique(results, "env")]
+    if any(min(of.values()) < SHORTER * max(of.values()) for of in steps):
+        lines.append("Dashed: the last value of a method with a smaller budget, held.")
     if plan["scale"] in NOT_A_RESULT:
         lines.append("Smoke scale runs every code path in minutes; it says nothing about the methods.")
     if plan.get("not_trained"):
@@ -102,13 +116,6 @@ def caption(results: Results, seeds: dict[str, dict[str, int]]) -> str:
             lines.append(f"Last 10 % of iterations, mean ± standard deviation over seeds, {label}: {final}.")
     lines += [f"Missing or incomplete: {what}." for what in results.missing_lines()]
     return "\n".join(lines) + "\n"
-
-
-def provenance(results: Results) -> str:
-    """The runs behind the picture, as one line."""
-    ids = sorted(set(results.frame["run_id"]))
-    digest = hashlib.sha256(" ".join(ids).encode()).hexdigest()[:12]
-    return f"{len(ids)} runs, set {digest}: {' '.join(ids)}"
 
 
 @dataclass(frozen=True)
@@ -171,7 +178,7 @@ def draw(results: Results, out: Path, extra: Extra | None = None) -> list[Path]:
     if plan["scale"] in NOT_A_RESULT:
         style.watermark(figure, NOT_A_RESULT[plan["scale"]])
     stem = out / plan["scale"] / plan["figure"]
-    paths = style.save(figure, stem, f"{plan['figure']}: {plan['title']}", provenance(results))
+    paths = style.save(figure, stem, f"{plan['figure']}: {plan['title']}", results.provenance())
     plt.close(figure)
     csv, text_path = stem.with_suffix(".csv"), stem.with_suffix(".caption.txt")
     results.frame.to_csv(csv, index=False, lineterminator="\n")

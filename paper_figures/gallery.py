@@ -101,7 +101,9 @@ def draw(robot: str, tables: dict[str, pd.DataFrame], out: Path) -> list[Path]:
             axes.set_ylabel("share of steps" if planar else "y (m)", fontsize=7)
 
     stem = out / "gallery" / robot
-    written = style.save(figure, stem, f"Skills of the {LABELS[robot]}", f"1 run: {trained['run_id']}")
+    written = style.save(
+        figure, stem, f"Skills of the {LABELS[robot]}", f"1 runs, set {trained['run_id']}: {trained['run_id']}"
+    )
     plt.close(figure)
     caption = stem.with_suffix(".caption.txt")
     count, steps = value(metrics, "trained", "paths"), value(metrics, "trained", "steps_per_path")

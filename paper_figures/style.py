@@ -70,19 +70,20 @@ def watermark(figure: Figure, text: str) -> None:
 
 
 def save(figure: Figure, stem: Path, title: str, provenance: str) -> list[Path]:
-    """Write `stem`.pdf and `stem`.png; the same figure gives the same bytes.
+    """Write `stem`.pdf, .svg and .png; the same figure gives the same bytes.
 
     Args:
         provenance: which runs and which commit stand behind it; goes into the files' metadata.
     """
     stem.parent.mkdir(parents=True, exist_ok=True)
-    pdf, png = stem.with_suffix(".pdf"), stem.with_suffix(".png")
+    pdf, svg, png = (stem.with_suffix(suffix) for suffix in (".pdf", ".svg", ".png"))
     information = {"Title": title, "Creator": "hippo-suite", "Keywords": provenance}
     for path, metadata in (
         (pdf, information | {"CreationDate": None, "Producer": None}),
+        (svg, {"Title": title, "Creator": "hippo-suite", "Description": provenance, "Date": None}),
         (png, {"Title": title, "Software": "hippo-suite", "Description": provenance}),
     ):
         temporary = path.with_name(f"{path.stem}.tmp{path.suffix}")
         figure.savefig(temporary, metadata=metadata, dpi=220)
         os.replace(temporary, path)
-    return [pdf, png]
+    return [pdf, svg, png]

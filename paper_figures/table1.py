@@ -89,7 +89,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     episodes = results.frame.groupby(["run_id", "metric"]).size().max()
     scale = " It says nothing about the methods." if options.scale == "smoke" else ""
     note = f"Scale: {options.scale}.{scale} {episodes} stochastic episodes per seed. {NOTE}"
-    comment = "runs: " + " ".join(sorted(set(results.frame["run_id"])))
+    comment = results.provenance()
     text = tabular.write(stem, results.plan["title"], note, rows(results), comment)
     results.frame.to_csv(stem.with_suffix(".csv"), index=False, lineterminator="\n")
     for what in results.missing_lines():

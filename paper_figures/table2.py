@@ -81,7 +81,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
     table, stem = rows(results), options.out / options.scale / "table2"
     note = f"Scale: {options.scale}." + (" It says nothing about the methods." if options.scale == "smoke" else "")
-    comment = "runs: " + " ".join(sorted(set(results.frame["run_id"])))
+    comment = results.provenance()
     text = tabular.write(stem, results.plan["title"], note, table, comment)
     results.frame.to_csv(stem.with_suffix(".csv"), index=False, lineterminator="\n")
     for what in results.missing_lines():

@@ -123,12 +123,12 @@ def test_the_runs_behind_a_picture_are_listed(tmp_path, capsys):
     planned(tmp_path, [3, 2])
     assert draw(tmp_path) == 0
     ids = sorted(run["run_id"] for run in json.loads((tmp_path / "plans/smoke/fig3.json").read_text())["runs"])
-    for suffix in ("png", "pdf", "csv"):
+    for suffix in ("png", "pdf", "svg", "csv"):
         assert explain.run_ids(tmp_path / f"out/smoke/fig3.{suffix}") == ids
     capsys.readouterr()
     assert explain.main([str(tmp_path / "out/smoke/fig3.pdf"), "--runs-dir", str(tmp_path)]) == 0
     assert "block_hopper  ppo  seed 1  failed" in capsys.readouterr().out
-    (tmp_path / "table.tex").write_text("% runs: 0123456789ab ba9876543210\n")
+    (tmp_path / "table.tex").write_text("% 2 runs, set 0123456789ab: 0123456789ab ba9876543210; commits: 0123456789\n")
     assert explain.run_ids(tmp_path / "table.tex") == ["0123456789ab", "ba9876543210"]
 
 

@@ -56,6 +56,7 @@ def made(module, runs, out, monkeypatch):
     """Run `python -m module` for the tiny scale in this process; its exit code."""
     arguments = [module, "--scale", SCALE, "--runs-dir", str(runs), "--out", str(out)]
     monkeypatch.setattr(sys, "argv", arguments)
+    monkeypatch.delitem(sys.modules, module, raising=False)  # another test may have imported it
     with pytest.raises(SystemExit) as end:
         runpy.run_module(module, run_name="__main__")
     return end.value.code
@@ -71,7 +72,9 @@ def test_nothing_is_drawn_that_has_no_configuration_and_nothing_configured_is_no
 def test_it_is_made_of_the_runs_of_its_plan(artefact, runs, tmp_path, monkeypatch, capsys):
     assert made(f"paper_figures.{artefact}", runs, tmp_path, monkeypatch) == 0
     assert "missing" not in capsys.readouterr().out
-    kinds = {"fig": (".png", ".pdf", ".caption.txt"), "table": (".tex", ".md", ".csv")}[artefact.rstrip("123456789")]
+    kinds = {"fig": (".png", ".pdf", ".svg", ".caption.txt"), "table": (".tex", ".md", ".csv")}[
+        artefact.rstrip("123456789")
+    ]
     for kind in kinds:
         assert (tmp_path / SCALE / f"{artefact}{kind}").stat().st_size > 100
     if artefact.startswith("fig") and artefact in FIGURES:

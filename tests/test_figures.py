@@ -25,7 +25,7 @@ def test_a_figure_is_drawn_with_its_numbers_and_its_caption(tmp_path, capsys):
     planned(tmp_path, [3, 2])
     assert draw(tmp_path) == 0
     folder = tmp_path / "out/smoke"
-    assert {p.name for p in folder.iterdir()} == {"fig3.csv", "fig3.pdf", "fig3.png", "fig3.caption.txt"}
+    assert {p.name for p in folder.iterdir()} == {"fig3.csv", "fig3.pdf", "fig3.svg", "fig3.png", "fig3.caption.txt"}
     caption = (folder / "fig3.caption.txt").read_text()
     for part in (
         "A title",
@@ -111,7 +111,7 @@ def test_a_figure_drawn_twice_is_the_same_file(tmp_path):
     planned(tmp_path, [3, 3])
     draw(tmp_path, "a")
     draw(tmp_path, "b")
-    for name in ("fig3.csv", "fig3.pdf", "fig3.png", "fig3.caption.txt"):
+    for name in ("fig3.csv", "fig3.pdf", "fig3.svg", "fig3.png", "fig3.caption.txt"):
         assert (tmp_path / "a/smoke" / name).read_bytes() == (tmp_path / "b/smoke" / name).read_bytes()
 
 
