@@ -129,17 +129,18 @@ class Extra:
 
 
 def draw(results: Results, out: Path, extra: Extra | None = None) -> list[Path]:
-    """Draw and write <figure>.csv, .pdf, .png and .caption.txt under `out`/<scale>/; returns the paths."""
+    """Draw and write <figure>.csv, .pdf, .svg, .png and .caption.txt under `out`/<scale>/; returns the paths."""
     style.use()
     plan = results.plan
     environments, variants = unique(results, "env"), unique(results, "variant")
     environments |= {left_out["env"]: left_out["env_label"] for left_out in plan.get("not_trained", [])}
     columns = min(4, len(environments))
     rows = -(-len(environments) // columns) + (extra is not None)
+    width = style.WIDTH * min(1, (columns + 1) / 3)  # a single panel as wide as a page would be flat
     # An entry takes about 0.6 in and 0.066 in a letter; more columns than fit would be cut at the edges.
-    legend_columns = max(1, min(5, int(style.WIDTH / (0.6 + 0.066 * max(map(len, variants.values()))))))
+    legend_columns = max(1, min(5, int(width / (0.6 + 0.066 * max(map(len, variants.values()))))))
     height = 2.25 * rows + 0.4 + 0.16 * -(-len(variants) // legend_columns)
-    figure, grid = plt.subplots(rows, columns, figsize=(style.WIDTH, height), squeeze=False, layout="constrained")
+    figure, grid = plt.subplots(rows, columns, figsize=(width, height), squeeze=False, layout="constrained")
     left_out_here = {left_out["env"] for left_out in plan.get("not_trained", [])}
     seeds = {}
     for axes, (env, label) in zip(grid.flat, environments.items(), strict=False):

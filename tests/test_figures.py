@@ -43,6 +43,27 @@ def test_a_figure_is_drawn_with_its_numbers_and_its_caption(tmp_path, capsys):
     assert f"{0:012x}".encode() in (folder / "fig3.png").read_bytes()  # provenance
 
 
+@pytest.mark.parametrize(("iterations", "lines"), [(3, 0), (6, 1)])
+def test_the_last_value_of_a_method_with_a_smaller_budget_is_held_dashed_and_said(
+    iterations, lines, tmp_path, monkeypatch
+):
+    planned(tmp_path, [3, iterations])
+    path = tmp_path / "plans/smoke/fig3.json"
+    plan = json.loads(path.read_text())
+    plan["runs"][1] |= {"variant": "hiro", "variant_label": "HIRO", "iterations": iterations, "state": "finished"}
+    path.write_text(json.dumps(plan))
+    dashed, save = [], style.save
+
+    def spy(figure, *rest):
+        dashed.extend(line for line in figure.axes[0].lines if line.get_linestyle() == "--")
+        return save(figure, *rest)
+
+    monkeypatch.setattr(style, "save", spy)
+    assert draw(tmp_path) == 0
+    assert [line.get_xydata().tolist() for line in dashed] == [[[0.03, 0.2], [0.06, 0.2]]] * lines
+    assert ("Dashed:" in (tmp_path / "out/smoke/fig3.caption.txt").read_text()) == bool(lines)
+
+
 def test_a_run_that_never_started_is_named_and_the_rest_is_drawn(tmp_path):
     planned(tmp_path, [3, None])
     assert draw(tmp_path) == 0
