@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from baselines import ppo
-from experiments import evaluate, train
+from experiments import evaluate, export, train
 from experiments.config import compose_run
 from hippo.core.episodes import opening_episodes
 from hippo.core.hierarchy import HierarchicalPolicy, collect
@@ -98,3 +98,26 @@ def test_the_command_line_writes_a_csv_or_refuses(trained, tmp_path, capsys):
         assert evaluate.main([*arguments, "--out", str(tmp_path / "no.csv")]) == 2
         assert message in capsys.readouterr().err
         assert not (tmp_path / "no.csv").exists()
+
+
+@pytest.mark.parametrize("algo", ["hippo", "ppo", "hier_vpg"])
+def test_an_exported_policy_acts_as_the_run_it_comes_from_and_is_smaller(algo, trained, tmp_path, capsys):
+    run = trained[algo]
+    assert export.main([str(run.folder), "--to", str(tmp_path)]) == 0
+    place = tmp_path / run.run_id
+    assert (place / "checkpoint.pt").stat().st_size < 0.6 * (run.folder / "checkpoint.pt").stat().st_size
+    again = evaluate.evaluate(evaluate.load_run(place), 3, 5)
+    assert returns(again) == returns(evaluate.evaluate(run, 3, 5))
+    assert f"wrote {place}" in capsys.readouterr().out
+
+
+def test_what_is_no_finished_run_is_not_exported(trained, tmp_path, capsys):
+    assert export.main([str(tmp_path), "--to", str(tmp_path / "out")]) == 2
+    unfinished = tmp_path / trained["ppo"].run_id
+    unfinished.mkdir()
+    (unfinished / "config.yaml").write_text(trained["ppo"].to_yaml())
+    assert export.main([str(unfinished), "--to", str(tmp_path / "out")]) == 2
+    errors = capsys.readouterr().err.splitlines()
+    assert "is no run folder" in errors[0]
+    assert "only finished runs are exported" in errors[1]
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,60 @@
+"""Final policies small enough to be committed: what evaluating and filming a run needs, without what training needs.
+
+    python -m experiments.export runs/<run_id> ... --to paper_figures/data/laptop/policies
+
+writes <run_id>/config.yaml, manifest.json and a checkpoint.pt that holds the networks that act and nothing else. Such a
+folder is a run folder to `experiments.evaluate` and `experiments.video`; training does not go on from it.
+"""
+
+import shutil
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from experiments.command_line import Parser, bad_input
+from experiments.evaluate import load_run
+from experiments.status import read_status
+from hippo.core import checkpoint
+from hippo.core.checkpoint import CheckpointError
+from hippo.core.settings import ConfigError
+
+ACTING = ("policy", "agents")  # the parts of a checkpoint that a learner's `rollout` restores
+COPIED = ("config.yaml", "manifest.json")
+
+
+def export(folder: Path, target: Path) -> Path:
+    """Write the run in `folder` to `target`/<run_id>; returns that folder.
+
+    Raises:
+        ConfigError: `folder` is no run's, or its run is not finished. CheckpointError: its checkpoint is damaged.
+    """
+    run, state = load_run(folder), read_status(folder)["state"]
+    if state != "finished":
+        raise ConfigError("run", folder, f"is {state}; only finished runs are exported")
+    content = checkpoint.load(folder / "checkpoint.pt")
+    kept = {name: part for name, part in content.items() if name in ("iteration", *ACTING)}
+    place = target / run.run_id
+    place.mkdir(parents=True, exist_ok=True)
+    for name in COPIED:
+        shutil.copyfile(folder / name, place / name)
+    checkpoint.save(place / "checkpoint.pt", kept)
+    return place
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Export from the command line."""
+    parser = Parser(prog="experiments.export", description=__doc__.splitlines()[0])
+    parser.add_argument("runs", type=Path, nargs="+", help="run folders")
+    parser.add_argument("--to", type=Path, required=True, help="folder to write to")
+    options = parser.parse_args(arguments)
+    try:
+        for folder in options.runs:
+            place = export(folder, options.to)
+            print(f"wrote {place}: {sum(path.stat().st_size for path in place.iterdir()) / 1000:.0f} kB")
+    except (ConfigError, CheckpointError) as error:
+        return bad_input(error)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
