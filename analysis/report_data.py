@@ -232,7 +232,7 @@ def read_artefact(name: str, folder: Path, plan: dict[str, Any] | None, states: 
         ValueError: its picture is none, or its table has rows of different lengths.
     """
     picture, caption, table = (folder / f"{name}{suffix}" for suffix in (".png", ".caption.txt", ".md"))
-    files = sorted(path for path in folder.glob(f"{name}.*") if path.suffix in (".csv", ".pdf", ".png", ".tex", ".md"))
+    files = sorted(path for path in folder.glob(f"{name}.*") if path.suffix in (".csv", ".pdf", ".svg", ".png", ".tex", ".md"))
     title, size, lines, cells = name, (0, 0), [], None
     if table.exists():
         text = table.read_text()
@@ -253,7 +253,7 @@ def read_artefact(name: str, folder: Path, plan: dict[str, Any] | None, states: 
     plan = plan or {"title": title, "runs": []}
     behind: set[str] = set()
     for path in files:
-        if path.suffix in (".pdf", ".png", ".tex"):
+        if path.suffix in (".pdf", ".svg", ".png", ".tex"):
             try:
                 behind |= set(explain.run_ids(path))
             except ValueError:  # a figure that nothing was trained for states no runs, which is not an error here

@@ -60,11 +60,15 @@ def budgets(results: Results, env: str) -> dict[str, float]:
 
 
 def write_seeds(axes: Axes, seeds: dict[str, int], variants: list[str]) -> None:
-    """Print the number of seeds in a panel: one number, or one per method in its colour where they differ."""
+    """Print the number of seeds in a panel: one number, or one per method in its colour where they differ.
+
+    A method that is in the legend but not in this panel counts 0.
+    """
     style_of: dict[str, Any] = {"fontsize": 6.5, "color": "#555555"}
-    parts: list[Artist] = [TextArea("n =", textprops=style_of)]
-    if len(set(seeds.values())) == 1:
-        parts.append(TextArea(str(min(seeds.values())), textprops=style_of))
+    parts: list[Artist] = [TextArea("seeds:", textprops=style_of)]
+    counts = {seeds.get(variant, 0) for variant in variants}
+    if len(counts) == 1:
+        parts.append(TextArea(str(min(counts)), textprops=style_of))
     else:
         for variant in variants:
             color = {"color": style.color_of(variant, variants), "fontweight": "bold"}
@@ -73,6 +77,14 @@ def write_seeds(axes: Axes, seeds: dict[str, int], variants: list[str]) -> None:
     box.patch.set(facecolor="white", edgecolor="none", alpha=0.75)
     box.set(in_layout=False, zorder=5)
     axes.add_artist(box)
+
+
+def legend_shape(labels: list[str], width: float) -> tuple[int, int]:
+    """Rows and columns of a legend on a figure of `width` inches, as even as can be."""
+    # An entry takes about 0.47 in and 0.055 in a letter; more columns than fit would be cut at the edges.
+    fitting = max(1, min(5, int(width / (0.47 + 0.055 * max(map(len, labels))))))
+    rows = -(-len(labels) // fitting)
+    return rows, -(-len(labels) // rows)
 
 
 def final_line(results: Results, env: str) -> str:
@@ -137,9 +149,8 @@ def draw(results: Results, out: Path, extra: Extra | None = None) -> list[Path]:
     columns = min(4, len(environments))
     rows = -(-len(environments) // columns) + (extra is not None)
     width = style.WIDTH * min(1, (columns + 1) / 3)  # a single panel as wide as a page would be flat
-    # An entry takes about 0.6 in and 0.066 in a letter; more columns than fit would be cut at the edges.
-    legend_columns = max(1, min(5, int(width / (0.6 + 0.066 * max(map(len, variants.values()))))))
-    height = 2.25 * rows + 0.4 + 0.16 * -(-len(variants) // legend_columns)
+    legend_rows, legend_columns = legend_shape(list(variants.values()), width)
+    height = 2.25 * rows + 0.4 + 0.16 * legend_rows
     figure, grid = plt.subplots(rows, columns, figsize=(width, height), squeeze=False, layout="constrained")
     left_out_here = {left_out["env"] for left_out in plan.get("not_trained", [])}
     seeds = {}

@@ -7,11 +7,12 @@ environment. Bold: the best return of a column's cell, as in the paper.
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
-import numpy as np
 import pandas as pd
 import yaml
 
+from analysis import stats
 from analysis.runs import MissingData, Results, load
 from paper_figures import command_line, tabular
 
@@ -19,9 +20,10 @@ HERE = Path(__file__).parent
 ORIGINAL = "return:none:original"
 CANNOT_CHANGE = {("snake_gather", "damping"), ("snake_gather", "friction")}  # docs/environments/perturbations.md
 NOTE = (
-    "Mean over seeds of the mean return of each seed's episodes, and the standard deviation over seeds; in brackets "
-    "the change of the return in percent of the original's absolute value. =: the change cannot alter the dynamics. "
-    "Bold: the best return in a changed environment."
+    "Mean over seeds of the mean return of each seed's episodes ± the standard deviation over seeds, its 95 % "
+    "percentile bootstrap interval over seeds, and the change in percent of the original return's absolute value. "
+    "=: the change cannot alter the dynamics. Bold: the best return in a changed environment. "
+    "Rows called paper: as printed there, five seeds."
 )
 
 
@@ -31,13 +33,17 @@ def per_seed(results: Results) -> pd.Series:
 
 
 def cell(values: pd.Series, original: float | None) -> str:
-    """Mean ± standard deviation over seeds, with the change."""
-    text = f"{values.mean():.2f} ± {np.std(values):.2f}"
+    """Mean ± standard deviation over seeds, interval, and the change; one seed has neither spread nor interval."""
+    scores = values.to_numpy(float)
+    text = f"{scores.mean():.2f}"
+    if len(scores) > 1:
+        interval = stats.bootstrap_mean(scores)
+        text += f" ± {stats.standard_deviation(scores):.2f} [{interval.low:.2f}, {interval.high:.2f}]"
     if original is None:
         return text
     if original == 0:
         return f"{text} (n/a)"
-    return f"{text} ({100 * (values.mean() - original) / abs(original):+.0f} %)"
+    return f"{text} ({100 * (scores.mean() - original) / abs(original):+.0f} %)"
 
 
 def rows(results: Results) -> list[tabular.Row]:
@@ -65,16 +71,16 @@ def rows(results: Results) -> list[tabular.Row]:
                 text = cell(means[env, variant, f"return:{change}:{strength}"], float(original.mean()))
                 mark = " =" if (env, change) in CANNOT_CHANGE else ""
                 row[change] = (f"**{text}**" if best[env, change] == variant else text) + mark
-            printed = paper.get(env, {}).get(variant) if strength == "original" else None
-            row["paper"] = "" if printed is None else _printed(printed)
             table.append(row)
+            if strength == "original" and variant in paper.get(env, {}):
+                table.append(printed_row(row, paper[env][variant]))
     return table
 
 
-def _printed(values: dict) -> str:
-    """The paper's row."""
-    changes = ", ".join(f"{name} {v[0]} ({v[1]:+d} %)" for name, v in values.items() if name != "initial")
-    return f"{values['initial']}; {changes}"
+def printed_row(row: tabular.Row, values: dict[str, Any]) -> tabular.Row:
+    """The paper's numbers in the columns of `row`."""
+    cells = {change: "{:.2f} ({:+d} %)".format(*values[change]) if change in values else "" for change in list(row)[5:]}
+    return row | {"method": "paper: " + row["method"], "n": "5", "original": f"{values['initial']:.2f}"} | cells
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -20,6 +20,8 @@ TEX = {
     ">": r"$>$",
 }
 Row = dict[str, str]
+LINE = 180  # letters of LaTeX's scriptsize beside each other on a landscape page
+LONG = 33  # letters above which a column may be wrapped
 
 
 def escaped(text: str) -> str:
@@ -41,6 +43,18 @@ def markdown(table: Sequence[Row]) -> str:
     return "\n".join(lines) + "\n"
 
 
+def columns(table: Sequence[Row]) -> str:
+    """LaTeX's column types: as wide as their text or, if the page is too narrow, long ones share what is left of it."""
+    names = list(table[0])
+    widths = [max(len(cell.replace("**", "")) for cell in (name, *(row[name] for row in table))) + 2 for name in names]
+    if sum(widths) <= LINE:
+        return "l" * len(names)
+    long = sum(width for width in widths if width > LONG)
+    left = (LINE - sum(width for width in widths if width <= LONG)) / LINE
+    paragraph = r">{\raggedright\arraybackslash}p{%.3f\linewidth}"
+    return "".join(paragraph % (left * width / long) if width > LONG else "l" for width in widths)
+
+
 def latex(table: Sequence[Row], comment: str) -> str:
     """The table as a LaTeX document that compiles alone.
 
@@ -49,9 +63,9 @@ def latex(table: Sequence[Row], comment: str) -> str:
     """
     lines = [
         f"% {comment}",
-        r"\documentclass{article}\usepackage{booktabs,longtable}\usepackage[margin=1cm,landscape]{geometry}",
-        r"\begin{document}\footnotesize",
-        rf"\begin{{longtable}}{{{'l' * len(table[0])}}}\toprule",
+        r"\documentclass{article}\usepackage{array,booktabs,longtable}\usepackage[margin=1cm,landscape]{geometry}",
+        r"\begin{document}\scriptsize\setlength\tabcolsep{3pt}",
+        rf"\begin{{longtable}}{{{columns(table)}}}\toprule",
         " & ".join(escaped(head) for head in table[0]) + r" \\ \midrule \endhead",
         *(" & ".join(escaped(cell) for cell in row.values()) + r" \\" for row in table),
         r"\bottomrule\end{longtable}\end{document}",

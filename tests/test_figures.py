@@ -7,6 +7,7 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import pytest
+from matplotlib.lines import Line2D
 from matplotlib.text import Text
 
 from analysis.runs import load
@@ -104,9 +105,36 @@ def two_methods(tmp_path, lengths):
 def test_methods_with_different_numbers_of_seeds_each_print_their_own(tmp_path, monkeypatch):
     two_methods(tmp_path, [3, 3, 3, 0])
     words = drawn_words(monkeypatch, tmp_path)
-    at = words.index("n =")
+    at = words.index("seeds:")
     assert words[at + 1 : at + 3] == ["2", "1"]
     assert "n = 1 to 2 seeds" in (tmp_path / "out/smoke/fig3.caption.txt").read_text()
+
+
+def test_a_method_of_the_legend_that_has_no_run_in_a_panel_counts_none_there(tmp_path, monkeypatch):
+    two_methods(tmp_path, [3, 3, 0, 0])
+    words = drawn_words(monkeypatch, tmp_path)
+    at = words.index("seeds:")
+    assert words[at + 1 : at + 3] == ["2", "0"]
+
+
+@pytest.mark.parametrize(
+    ("labels", "shape"),
+    [
+        (["random p, skill-conditioned"] * 4, (2, 2)),
+        (["manager only p = 10, fixed skills"] * 8, (3, 3)),
+        (["HiPPO p = 10"] * 6, (2, 3)),
+        (["PPO with action repeat 10"] * 4, (2, 2)),
+    ],
+)
+def test_a_legend_is_even_and_fits_the_page(labels, shape):
+    assert curves.legend_shape(labels, style.WIDTH) == shape
+    style.use()
+    figure = plt.figure(figsize=(style.WIDTH, 2))
+    handles = [Line2D([], [], label=label) for label in labels]
+    legend = figure.legend(handles=handles, ncols=shape[1], columnspacing=1.2)
+    figure.draw_without_rendering()
+    assert legend.get_window_extent().width <= figure.bbox.width
+    plt.close(figure)
 
 
 def test_seeds_that_report_at_different_steps_still_have_a_mean(tmp_path):
