@@ -18,6 +18,7 @@ ROOT = Path(__file__).parent.parent
 LEDGER = ROOT / "docs" / "hyperparameters.csv"
 OWN_FILES = ("claims", "report")  # Markdown files of a scale's folder that are no tables
 VIDEOS = {".mp4": "video/mp4", ".gif": "image/gif"}
+STATING = (".pdf", ".svg", ".png", ".tex")  # files that state the runs behind them
 THERE = ("finished", "committed")
 NOT_HERE = "not trained here"  # a run that others start from; committed skills may stand in for it
 
@@ -232,7 +233,7 @@ def read_artefact(name: str, folder: Path, plan: dict[str, Any] | None, states: 
         ValueError: its picture is none, or its table has rows of different lengths.
     """
     picture, caption, table = (folder / f"{name}{suffix}" for suffix in (".png", ".caption.txt", ".md"))
-    files = sorted(path for path in folder.glob(f"{name}.*") if path.suffix in (".csv", ".pdf", ".svg", ".png", ".tex", ".md"))
+    files = sorted(path for path in folder.glob(f"{name}.*") if path.suffix in (*STATING, ".csv", ".md"))
     title, size, lines, cells = name, (0, 0), [], None
     if table.exists():
         text = table.read_text()
@@ -253,7 +254,7 @@ def read_artefact(name: str, folder: Path, plan: dict[str, Any] | None, states: 
     plan = plan or {"title": title, "runs": []}
     behind: set[str] = set()
     for path in files:
-        if path.suffix in (".pdf", ".svg", ".png", ".tex"):
+        if path.suffix in STATING:
             try:
                 behind |= set(explain.run_ids(path))
             except ValueError:  # a figure that nothing was trained for states no runs, which is not an error here
