@@ -40,11 +40,19 @@ report: install claims  ## one page with everything drawn at SCALE
 skills-gallery: install  ## measure and draw the given skills, and a short video of each where OpenGL works
 	@$(PY) experiments.gallery paper_figures/data/skills/*.pt
 	@$(PY) paper_figures.gallery
-	@$(PY) experiments.gallery paper_figures/data/skills/*.pt --videos paper_figures/out/gallery || \
-		echo "no videos: 'make install-render' installs what drawing needs" >&2
+	@$(PY) experiments.gallery paper_figures/data/skills/*.pt --videos paper_figures/out/gallery || [ $$? -eq 1 ]  # no OpenGL
 
 claims: install  ## the paper's comparative sentences and what the results at SCALE say about them
 	@$(PY) analysis.claims $(DRAW_FLAGS)
+
+results: install  ## docs/results.md and its pictures, from the committed results
+	@for scale in laptop paper; do $(PY) experiments.sweep plan all --scale $$scale --runs-dir build/results --write > /dev/null; done
+	@for csv in paper_figures/data/*/fig*.csv; do \
+		scale=$$(basename $$(dirname $$csv)); figure=$$(basename $$csv .csv); \
+		$(PY) paper_figures.$$figure --scale $$scale --runs-dir build/results --out build/results/out > /dev/null && \
+		cp build/results/out/$$scale/$$figure.png docs/pictures/$${scale}_$$figure.png; \
+	done
+	@$(PY) analysis.results --runs-dir build/results
 
 plan-%: install
 	@$(PY) experiments.sweep plan $* $(SWEEP_FLAGS)
@@ -89,4 +97,4 @@ help:  ## this list
 	@echo "  make tableN      the same for: $(or $(TABLES),none yet)"
 	@echo "  make plan-figN   what it would train and cost, without training"
 
-.PHONY: install install-render all report skills-gallery claims lint test test-slow test-slurm test-report smoke bench video clean help $(FIGURES) $(TABLES)
+.PHONY: install install-render all report skills-gallery claims results lint test test-slow test-slurm test-report smoke bench video clean help $(FIGURES) $(TABLES)

@@ -1,11 +1,13 @@
 """How diverse the skills of a skills file are: measured on fresh paths, beside skills that nobody trained.
 
-    python -m experiments.gallery paper_figures/data/skills/ant.pt [--paths 600] [--videos]
+    python -m experiments.gallery paper_figures/data/skills/ant.pt [--paths 600] [--out DIR] [--videos DIR]
 
-writes beside the file <name>.metrics.csv, <name>.paths.csv (some paths) and <name>.visits.csv (visits per cell), which
-`python -m paper_figures.gallery` draws, and with --videos a short video of each skill. docs/skills.md has formulas.
+writes beside the file, or in --out, <name>.metrics.csv, <name>.paths.csv (some paths) and <name>.visits.csv (visits per
+cell), which `python -m paper_figures.gallery` draws, and with --videos a short video of each skill. docs/skills.md has
+the formulas.
 """
 
+import hashlib
 import itertools
 import sys
 import time
@@ -35,12 +37,14 @@ from hippo.envs.rendering import NoOpenGL
 STEPS = {"snn": 400, "diayn": 1000}  # of a path, as in pre-training at laptop scale
 CELLS_PER_METRE = 10
 PERMUTATIONS = 100
+RANDOM_NETWORKS = 3  # each as many paths as the trained one, so that every measure compares
 BLOCK = 60  # paths simulated side by side
 DRAWN_PATHS = 6  # per skill, in paths.csv
 DRAWN_POINTS = 40  # of a path
 STATES = 2000  # at which action distributions are compared
 VIDEO_STEPS = {"ant": 400, "snake": 100, "hopper": 250, "half_cheetah": 100}  # 4 to 5 s
 PHYSICS = "paper"
+TABLES = ("paths", "visits", "metrics")
 
 
 @dataclass
@@ -76,9 +80,12 @@ def split(paths: int) -> list[int]:
 
 
 def from_start(paths: Paths) -> np.ndarray:
-    """(T + 1, P, 2) m, the centre of mass from where the path started."""
+    """(T + 1, P, 2) m, the centre of mass from where the path started; a path that ends early stays where it ended."""
     position = np.concatenate([paths.position[:1].numpy(), paths.next_position.numpy()])[..., :2]
-    return position - position[0]
+    done = paths.steps.done.numpy()
+    last = np.where(done.any(0), done.argmax(0) + 1, len(done))  # what follows in the same slot is another path
+    row = np.minimum(np.arange(len(position))[:, None], last)
+    return np.take_along_axis(position, row[..., None], 0) - position[0]
 
 
 def information(cell: np.ndarray, skill: np.ndarray, num_skills: int) -> float:
@@ -126,8 +133,8 @@ def action_distance(policy: SkillPolicy, obs: Tensor) -> float:
     return float(torch.stack(distances).mean()) if distances else 0.0
 
 
-def measure(group: str, policy: SkillPolicy, names: Sequence[str], rollouts: Rollouts) -> list[dict[str, Any]]:
-    """Rows group, metric, skill ("" for all), value."""
+def measure(policy: SkillPolicy, names: Sequence[str], rollouts: Rollouts) -> pd.DataFrame:
+    """Rows metric, skill ("" for all), value."""
     n, cell = policy.num_skills, cells(rollouts.place[1:], CELLS_PER_METRE)
     plug_in = information(cell, rollouts.skill, n)
     chance = permuted_information(cell, rollouts.skill, n, 0)
@@ -147,15 +154,22 @@ def measure(group: str, policy: SkillPolicy, names: Sequence[str], rollouts: Rol
         "cells": len(np.unique(cell.reshape(-1, 2), axis=0)),
         "distance": float(end.mean()),
     }
-    rows = [{"group": group, "metric": name, "skill": "", "value": value} for name, value in values.items()]
+    rows: list[dict[str, Any]] = [{"metric": name, "skill": "", "value": value} for name, value in values.items()]
     for z in range(n):
         mine = rollouts.skill == z
         of_skill = {
             "distance": float(end[mine].mean()),
             "cells": len(np.unique(cell[:, mine].reshape(-1, 2), axis=0)),
         }
-        rows += [{"group": group, "metric": name, "skill": z, "value": value} for name, value in of_skill.items()]
-    return rows
+        rows += [{"metric": name, "skill": z, "value": value} for name, value in of_skill.items()]
+    return pd.DataFrame(rows)
+
+
+def further_than_random(metrics: pd.DataFrame) -> int:
+    """How many trained skills end further from the start, on average, than every random skill of every network."""
+    of_skills = metrics[(metrics["metric"] == "distance") & (metrics["skill"] != "")]
+    best = of_skills.loc[of_skills["group"] == "random", "value"].max()
+    return int((of_skills.loc[of_skills["group"] == "trained", "value"] > best).sum())
 
 
 def drawn_paths(group: str, rollouts: Rollouts) -> pd.DataFrame:
@@ -190,51 +204,71 @@ def study(path: Path, paths: int, seed: int) -> dict[str, pd.DataFrame]:
     if paths < 2 * n:
         raise ConfigError("paths", paths, f"must be at least {2 * n}, two for each of {n} skills")
     env, steps = metadata["env"], STEPS[metadata["algo"]]
-    untrained = SkillPolicy(
+    policies = {("trained", 0): policy} | {
+        ("random", network): untrained(metadata, seeding.torch_generator(seed, "random skills", network))
+        for network in range(RANDOM_NETWORKS)
+    }
+    envs = make(env, 1, 0)
+    names = envs.observation_names[: metadata["obs_size"]]
+    envs.close()
+    metrics, rolled = [], {}
+    for (group, network), each in policies.items():
+        what = group if group == "trained" else f"{group} ({network + 1} of {RANDOM_NETWORKS} networks)"
+        rollouts = roll_out(each, env, steps, paths, seed, what)
+        metrics.append(measure(each, names, rollouts).assign(group=group, network=network))
+        if network == 0:  # the others are measured, not drawn
+            rolled[group] = rollouts
+    measured = pd.concat(metrics)[["group", "network", "metric", "skill", "value"]]
+    further = {"group": "trained", "network": 0, "metric": "skills_further_than_random", "skill": ""}
+    measured = pd.concat([measured, pd.DataFrame([further | {"value": further_than_random(measured)}])])
+    reach = max(float(np.abs(rollouts.place).max()) for rollouts in rolled.values())
+    density = 25 / max(reach, 0.1)  # some 50 cells across the picture
+    provenance = {name: metadata[name] for name in ("env", "algo", "run_id", "env_steps")}
+    provenance |= {"trained_physics": metadata["physics"], "measured_physics": PHYSICS}
+    return {
+        "metrics": measured.assign(**provenance, skills_sha256=digest(path)),
+        "paths": pd.concat([drawn_paths(group, rollouts) for group, rollouts in rolled.items()]),
+        "visits": pd.concat([visits(group, rollouts, density) for group, rollouts in rolled.items()]),
+    }
+
+
+def untrained(metadata: dict[str, Any], generator: torch.Generator) -> SkillPolicy:
+    """Skills as drawn, of the network that a skills file's metadata describe."""
+    return SkillPolicy(
         metadata["obs_size"],
-        n,
+        metadata["num_skills"],
         metadata["action_size"],
         metadata["hidden_sizes"],
-        seeding.torch_generator(seed, "random skills"),
+        generator,
         metadata["integration"],
         metadata["log_std_per_skill"],
     )
-    names = make(env, 1, 0).observation_names[: metadata["obs_size"]]
-    rows: list[dict[str, Any]] = []
-    walked, seen = [], []
-    groups = {"trained": policy, "random": untrained}
-    rolled = {group: roll_out(each, env, steps, paths, seed, group) for group, each in groups.items()}
-    reach = max(float(np.abs(rollouts.place).max()) for rollouts in rolled.values())
-    for group, rollouts in rolled.items():
-        rows += measure(group, groups[group], names, rollouts)
-        walked.append(drawn_paths(group, rollouts))
-        seen.append(visits(group, rollouts, 25 / max(reach, 0.1)))  # some 50 cells across the picture
-    metrics = pd.DataFrame(rows)
-    best = metrics.query("group == 'random' and metric == 'distance' and skill != ''")["value"].max()
-    own = metrics.query("group == 'trained' and metric == 'distance' and skill != ''")["value"]
-    further = {
-        "group": "trained",
-        "metric": "skills_further_than_random",
-        "skill": "",
-        "value": int((own > best).sum()),
-    }
-    metrics = pd.concat([metrics, pd.DataFrame([further])])
-    provenance = {name: metadata[name] for name in ("env", "algo", "run_id", "env_steps")}
-    provenance |= {"trained_physics": metadata["physics"], "measured_physics": PHYSICS}
-    return {"metrics": metrics.assign(**provenance), "paths": pd.concat(walked), "visits": pd.concat(seen)}
 
 
-def write(path: Path, tables: dict[str, pd.DataFrame]) -> None:
-    """Write the tables beside the skills file at `path`."""
+def digest(path: Path) -> str:
+    """The start of a file's SHA-256; skills trained anew by changed code may keep their run's id."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()[:12]
+
+
+def table_path(path: Path, folder: Path, name: str) -> Path:
+    """Where a table about the skills file at `path` is."""
+    return folder / f"{path.stem}.{name}.csv"
+
+
+def write(path: Path, folder: Path, tables: dict[str, pd.DataFrame]) -> None:
+    """Write the tables about the skills file at `path` into `folder`."""
+    folder.mkdir(parents=True, exist_ok=True)
     for name, table in tables.items():
         text = table.to_csv(index=False, lineterminator="\n", float_format="%.6g")
-        write_atomically(path.with_name(f"{path.stem}.{name}.csv"), text)
+        write_atomically(table_path(path, folder, name), text)
 
 
-def is_measured(path: Path) -> bool:
-    """Whether the tables beside a skills file are about these very skills."""
-    metrics = path.with_name(f"{path.stem}.metrics.csv")
-    return metrics.exists() and set(pd.read_csv(metrics, dtype=str)["run_id"]) == {policy_of(path)[1]["run_id"]}
+def is_measured(path: Path, folder: Path) -> bool:
+    """Whether the tables in `folder` are about the skills file at `path` as it is now."""
+    if not path.is_file() or not all(table_path(path, folder, name).exists() for name in TABLES):
+        return False
+    lines = table_path(path, folder, "metrics").read_text().splitlines()
+    return len(lines) > 1 and all(line.endswith(f",{digest(path)}") for line in lines[1:])
 
 
 def film(path: Path, folder: Path, seed: int) -> None:
@@ -263,14 +297,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("skills", type=Path, nargs="+", help="skills files")
     parser.add_argument("--paths", type=int, default=600, help="fresh paths of the skills, and of random ones")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out", type=Path, help="folder of the tables (default: that of the skills file)")
     parser.add_argument("--videos", type=Path, help="folder for a short video of each skill")
     parser.add_argument("--again", action="store_true", help="measure what is already measured")
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
     try:
         for path in options.skills:
-            if options.again or not is_measured(path):
-                write(path, study(path, options.paths, options.seed))
+            folder = options.out or path.parent
+            if options.again or not is_measured(path, folder):
+                write(path, folder, study(path, options.paths, options.seed))
             if options.videos is not None:
                 film(path, options.videos, options.seed)
     except (ConfigError, SkillsError) as error:

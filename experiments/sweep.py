@@ -164,6 +164,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--fresh", action="store_true", help="ignore committed results")
     parser.add_argument("--max-core-hours", type=float, default=100.0, help="refuse to start more than this")
     parser.add_argument("--yes", action="store_true", help="start it all the same")
+    parser.add_argument("--write", action="store_true", help="plan: also write the plans that drawing reads")
     parser.add_argument("--watch", action="store_true", help="status: again and again until nothing runs")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="override in every run")
     return parser.parse_args(arguments)
@@ -193,7 +194,11 @@ def check_options(options: argparse.Namespace) -> None:
 def show_plan(options: argparse.Namespace, plan_of: Callable[[str], Plan]) -> int:
     """`plan`."""
     figures = choices("figure") if options.figure == "all" else [options.figure]
-    print(overview([plan_of(figure) for figure in figures], options.workers))
+    plans = [plan_of(figure) for figure in figures]
+    print(overview(plans, options.workers))
+    if options.write:
+        for plan in plans:
+            plan.write(options.runs_dir)
     return 0
 
 

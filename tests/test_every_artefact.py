@@ -65,7 +65,7 @@ def made(module, runs, out, monkeypatch):
 def test_nothing_is_drawn_that_has_no_configuration_and_nothing_configured_is_not_drawn():
     trained_nothing = {"fig1", "fig2", "table3"}
     assert set(ARTEFACTS) - trained_nothing == set(FIGURES)
-    assert {f"fig{i}" for i in range(1, 10)} | {f"table{i}" for i in range(1, 4)} == set(ARTEFACTS)
+    assert {f"fig{i}" for i in range(1, 10)} | {f"table{i}" for i in range(1, 4)} <= set(ARTEFACTS)
 
 
 @pytest.mark.parametrize("artefact", ARTEFACTS)

@@ -1,6 +1,8 @@
 """The skills gallery: information against cases worked by hand, and from a skills file to a picture."""
 
+import hashlib
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -60,43 +62,90 @@ def test_the_distance_of_action_distributions_worked_by_hand():
     assert gallery.action_distance(TwoSkills(), torch.zeros(5, 3)) == pytest.approx(math.sqrt(25 + 144))
 
 
+def test_a_path_that_ends_early_stays_where_it_ended():
+    # Path 0 ends after its second step, 3 m from its start; the slot goes on with a new path from elsewhere.
+    x = np.array([[1.0, 0.0], [2.0, 1.0], [50.0, 2.0], [51.0, 3.0]])
+    after = np.array([[2.0, 1.0], [4.0, 2.0], [51.0, 3.0], [52.0, 4.0]])
+    done = torch.tensor([[0, 0], [1, 0], [0, 0], [1, 1]], dtype=torch.bool)
+    flat = lambda a: torch.from_numpy(np.stack([a, np.zeros_like(a), np.zeros_like(a)], -1))  # noqa: E731
+    paths = SimpleNamespace(steps=SimpleNamespace(done=done), position=flat(x), next_position=flat(after))
+    place = gallery.from_start(paths)
+    assert place[..., 0].T.tolist() == [[0, 1, 3, 3, 3], [0, 1, 2, 3, 4]]
+    assert after[-1, 0] - x[0, 0] == 51  # what the slot's last position would have claimed
+
+
+def test_a_skill_counts_as_further_only_beyond_every_random_skill_of_every_network():
+    rows = [("trained", 0, 0, 5.0), ("trained", 0, 1, 3.0), ("trained", 0, "", 9.0)]
+    rows += [("random", 0, 0, 2.0), ("random", 1, 0, 4.0), ("random", 1, "", 9.0)]
+    metrics = pd.DataFrame(rows, columns=["group", "network", "skill", "value"]).assign(metric="distance")
+    assert gallery.further_than_random(metrics) == 1
+    assert gallery.further_than_random(metrics[metrics["network"] == 0]) == 2
+
+
 def test_from_a_skills_file_to_a_picture_that_is_the_same_twice(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(gallery.STEPS, "diayn", 25)
     path = tmp_path / "hopper.pt"
     skills_file(path)
-    assert gallery.main([str(path), "--paths", "8"]) == 0
+    data = tmp_path / "measured"
+    assert gallery.main([str(path), "--paths", "8", "--out", str(data)]) == 0
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["hopper.pt", "measured"]
     assert "hopper, trained skills: 8/8 paths" in capsys.readouterr().out
-    metrics = pd.read_csv(tmp_path / "hopper.metrics.csv")
-    assert set(metrics["group"]) == {"trained", "random"}
+    metrics = pd.read_csv(data / "hopper.metrics.csv")
+    assert metrics.groupby("group")["network"].nunique().to_dict() == {"random": 3, "trained": 1}
     assert set(metrics["run_id"]) == {"0123456789ab"}
+    assert set(metrics["skills_sha256"]) == {hashlib.sha256(path.read_bytes()).hexdigest()[:12]}
     of_all = metrics[(metrics["group"] == "trained") & metrics["skill"].isna()].set_index("metric")["value"]
     assert of_all["paths"] == 8
     difference = of_all["information"] - of_all["information_permuted"]
     assert of_all["information_corrected"] == pytest.approx(difference, abs=1e-5)
-    visits = pd.read_csv(tmp_path / "hopper.visits.csv")
+    random = metrics[(metrics["group"] == "random") & metrics["skill"].isna() & (metrics["metric"] == "distance")]
+    assert random["value"].nunique() == 3
+    assert pictures.value(metrics, "random", "distance") == pytest.approx(random["value"].mean())
+    visits = pd.read_csv(data / "hopper.visits.csv")
     assert visits.groupby("group")["steps"].sum().tolist() == [8 * 25, 8 * 25]
     for out in ("a", "b"):
-        assert pictures.main(["--data", str(tmp_path), "--out", str(tmp_path / out)]) == 0
-    for name in ("hopper.png", "hopper.pdf", "hopper.caption.txt"):
+        assert pictures.main(["--data", str(data), "--out", str(tmp_path / out)]) == 0
+    for name in ("hopper.png", "hopper.pdf", "hopper.svg", "hopper.caption.txt"):
         assert (tmp_path / "a/gallery" / name).read_bytes() == (tmp_path / "b/gallery" / name).read_bytes()
 
 
-def test_what_is_measured_is_not_measured_again_but_for_other_skills_it_is(tmp_path, monkeypatch):
+def test_what_is_measured_is_not_measured_again_but_other_skills_are_even_of_the_same_run(tmp_path, monkeypatch):
     path = tmp_path / "hopper.pt"
     skills_file(path)
     studied = []
 
-    def study(*_):
+    def study(skills, *_):
         studied.append(1)
-        return {"metrics": pd.DataFrame({"run_id": ["0123456789ab" if len(studied) == 1 else "other"]})}
+        table = pd.DataFrame({"run_id": ["0123456789ab"], "skills_sha256": [gallery.digest(skills)]})
+        return {"metrics": table, "paths": table, "visits": table}
 
     monkeypatch.setattr(gallery, "study", study)
     for _ in range(2):
         assert gallery.main([str(path)]) == 0
     assert len(studied) == 1
-    (tmp_path / "hopper.metrics.csv").write_text("run_id\nffffffffffff\n")
+    (tmp_path / "hopper.visits.csv").unlink()
     gallery.main([str(path)])
     assert len(studied) == 2
+    skills_file(path, num_skills=3)  # the run's id is the same
+    gallery.main([str(path)])
+    assert len(studied) == 3
+
+
+def test_where_nothing_can_draw_one_line_says_what_to_install(tmp_path, monkeypatch, capsys):
+    path = tmp_path / "hopper.pt"
+    skills_file(path)
+    monkeypatch.setattr(gallery, "is_measured", lambda *_: True)
+    monkeypatch.setenv("MUJOCO_GL", "nothing")
+    assert gallery.main([str(path), "--videos", str(tmp_path / "videos")]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "make install-render" in line
+    assert list((tmp_path / "videos").iterdir()) == []
+
+
+def test_cells_are_as_wide_as_the_smallest_gap_between_their_middles():
+    middles = pd.Series([0.5, 0.533, 0.567, 0.7])  # thirtieths, written to the millimetre
+    assert pictures.spacing(middles) == pytest.approx(1 / 30, rel=0.002)
+    assert pictures.spacing(pd.Series([0.5, 0.5])) == 1
 
 
 def test_bad_input_is_named_in_one_line(tmp_path, capsys):
@@ -113,3 +162,10 @@ def test_bad_input_is_named_in_one_line(tmp_path, capsys):
     assert "damaged" in errors[2]
     assert pictures.main(["--data", str(tmp_path)]) == 2
     assert "no measured skills" in capsys.readouterr().err
+
+
+def test_the_page_about_skills_has_the_table_that_the_committed_measurements_give(capsys):
+    assert pictures.main(["--table"]) == 0
+    page = (pictures.SKILLS.parents[2] / "docs/skills.md").read_text()
+    between = page.partition("--table -->\n")[2].partition("<!-- end of table -->")[0]
+    assert between == capsys.readouterr().out

@@ -1,0 +1,60 @@
+"""The documentation: every link, picture, target and module that it names is there."""
+
+import importlib.util
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+ids = [str(page.relative_to(ROOT)) for page in PAGES]
+
+
+def links(text):
+    """Targets of Markdown links and pictures that are no web addresses, without their fragments."""
+    found = re.findall(r"\]\(([^)\s]+)\)", text)
+    return [target.partition("#")[0] for target in found if not re.match(r"[a-z]+:", target) and target[0] != "#"]
+
+
+def targets():
+    """Names of the Makefile's targets, patterns expanded."""
+    names = set(re.findall(r"^([a-z%-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    return names | {path.stem for path in (ROOT / "paper_figures").glob("*.py")}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=ids)
+def test_every_link_and_picture_is_there(page):
+    missing = [target for target in links(page.read_text()) if not (page.parent / target).exists()]
+    assert not missing
+
+
+@pytest.mark.parametrize("page", PAGES, ids=ids)
+def test_every_make_target_and_module_that_is_named_exists(page):
+    text = page.read_text()
+    named = set(re.findall(r"(?:^|`|    )make ([a-z][a-z0-9-]*)", text, re.MULTILINE))
+    known = targets()
+    assert not {name for name in named if name not in known and not name.startswith("plan-")}
+    modules = {name.rstrip(".") for name in re.findall(r"python -m ([a-z_.0-9]+)", text)}
+    made_by_the_page = {name.removesuffix(".py").replace("/", ".") for name in re.findall(r"title=\"(.*?)\"", text)}
+    assert not {name for name in modules - made_by_the_page if importlib.util.find_spec(name) is None}
+
+
+def test_a_broken_link_would_be_found():
+    assert links("[a](there.md#x) ![b](pictures/b.png) [c](https://example.org) [d](#here)") == [
+        "there.md",
+        "pictures/b.png",
+    ]
+
+
+def test_every_page_is_reached_from_the_readme():
+    seen, todo = set(), [ROOT / "README.md"]
+    while todo:
+        page = todo.pop()
+        if page in seen or page.suffix != ".md" or not page.exists():
+            continue
+        seen.add(page)
+        for target in links(page.read_text()):
+            place = (page.parent / target).resolve()
+            todo += sorted(place.glob("*.md")) if place.is_dir() else [place]
+    assert not [str(page.relative_to(ROOT)) for page in PAGES if page not in seen]

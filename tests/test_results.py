@@ -1,0 +1,68 @@
+"""The results page: numbers by hand, nothing pooled, and the committed page is what the committed rows say."""
+
+import json
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from analysis import results
+from analysis.runs import COLUMNS
+from experiments.plan import make_plan
+from tests.test_analysis import planned
+
+ROOT = Path(__file__).parent.parent
+
+
+def committed(tmp_path, scale="laptop"):
+    """A plan and committed rows: PPO, two seeds, ten iterations, returns 0 to 9 and 10 to 19."""
+    planned(tmp_path, [10, 10], iterations=10, states=("committed", "committed"))
+    plan = json.loads((tmp_path / "plans/smoke/fig3.json").read_text()) | {"scale": scale}
+    (tmp_path / "plans" / scale).mkdir()
+    (tmp_path / f"plans/{scale}/fig3.json").write_text(json.dumps(plan))
+    rows = [
+        ["fig3", scale, "block_hopper", "ppo", seed, f"{seed:012x}", 10 * (i + 1), "return_mean", 10.0 * seed + i]
+        for seed in (0, 1)
+        for i in range(10)
+    ]
+    (tmp_path / "data" / scale).mkdir(parents=True)
+    pd.DataFrame(rows, columns=COLUMNS).to_csv(tmp_path / f"data/{scale}/fig3.csv", index=False)
+
+
+def test_final_and_area_by_hand(tmp_path):
+    committed(tmp_path)
+    page = results.page(tmp_path, tmp_path / "data", tmp_path)
+    # Last 10 %: 9 and 19, whose deviation is sqrt(50); areas: 4.5 and 14.5.
+    assert "| PPO | 2 | 0.0 M | 14.00 ± 7.07 | 9.50 ± 7.07 |" in page
+    assert "## A title (fig3, laptop scale)" in page
+    assert "| no data |" in page
+    assert "reproduced |" not in page
+
+
+def test_without_committed_rows_it_says_so(tmp_path):
+    assert "No results are committed yet." in results.page(tmp_path, tmp_path / "data", tmp_path)
+
+
+def test_rows_without_a_plan_are_one_clear_error(tmp_path, capsys):
+    committed(tmp_path)
+    (tmp_path / "plans/laptop/fig3.json").unlink()
+    arguments = ["--runs-dir", str(tmp_path), "--data", str(tmp_path / "data"), "--docs", str(tmp_path)]
+    assert results.main(arguments) == 2
+    assert "no plan at scale laptop" in capsys.readouterr().err
+    assert not (tmp_path / "results.md").exists()
+
+
+def test_the_committed_page_is_fresh(tmp_path):
+    for scale in results.SCALES:
+        for path in sorted((results.DATA / scale).glob("*.csv")):
+            make_plan(path.stem, scale, [], False, tmp_path).write(tmp_path)
+    written = (ROOT / "docs" / "results.md").read_text()
+    assert results.page(tmp_path, results.DATA, ROOT / "docs" / "pictures") == written, "run `make results`"
+
+
+@pytest.mark.parametrize("scale", results.SCALES)
+def test_every_committed_row_belongs_to_a_planned_run(scale, tmp_path):
+    for path in sorted((results.DATA / scale).glob("*.csv")):
+        plan = make_plan(path.stem, scale, [], False, tmp_path)
+        ids = set(pd.read_csv(path, dtype={"run_id": str})["run_id"])
+        assert ids <= {entry.run.run_id for entry in plan.entries}
