@@ -203,7 +203,11 @@ def study(path: Path, paths: int, seed: int) -> dict[str, pd.DataFrame]:
     n = policy.num_skills
     if paths < 2 * n:
         raise ConfigError("paths", paths, f"must be at least {2 * n}, two for each of {n} skills")
-    env, steps = metadata["env"], STEPS[metadata["algo"]]
+    env, algo = metadata["env"], metadata["algo"]
+    if algo not in STEPS or env not in VIDEO_STEPS:
+        valid = f"must hold skills of {', '.join(STEPS)} for {', '.join(VIDEO_STEPS)}, not of {algo} for {env}"
+        raise ConfigError("skills", path, valid)
+    steps = STEPS[algo]
     policies = {("trained", 0): policy} | {
         ("random", network): untrained(metadata, seeding.torch_generator(seed, "random skills", network))
         for network in range(RANDOM_NETWORKS)

@@ -16,12 +16,13 @@ from hippo.envs import make
 from paper_figures import gallery as pictures
 
 
-def skills_file(path, num_skills=2):
+def skills_file(path, num_skills=2, **changes):
     envs = make("hopper", 1, 0)
     policy = SkillPolicy(envs.robot_size, num_skills, 3, [8, 8], torch.Generator().manual_seed(3))
     envs.close()
     metadata = {"robot": "hopper", "observation": "paper", "env": "hopper", "algo": "diayn"}
-    save_skills(path, policy, metadata | {"run_id": "0123456789ab", "env_steps": 1, "physics": "paper"})
+    metadata |= {"run_id": "0123456789ab", "env_steps": 1, "physics": "paper"}
+    save_skills(path, policy, metadata | changes)
     return policy
 
 
@@ -160,6 +161,9 @@ def test_bad_input_is_named_in_one_line(tmp_path, capsys):
     assert "No such file" in errors[0]
     assert "paths=3: must be at least 4, two for each of 2 skills" in errors[1]
     assert "damaged" in errors[2]
+    skills_file(path, algo="vic")
+    assert gallery.main([str(path)]) == 2
+    assert "must hold skills of snn, diayn for ant" in capsys.readouterr().err
     assert pictures.main(["--data", str(tmp_path)]) == 2
     assert "no measured skills" in capsys.readouterr().err
 
