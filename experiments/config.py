@@ -222,7 +222,8 @@ class Run:
     def from_yaml(text: str, runs_dir: Path) -> "Run":
         """Rebuild a run from what `to_yaml` wrote."""
         plain = yaml.safe_load(text)
-        return Run(**plain | {"config": config_class(plain["algo"])(**plain["config"]), "runs_dir": runs_dir})
+        mirror = {"wandb_mode": WandbConfig.mode, "wandb_project": WandbConfig.project}  # older runs do not say
+        return Run(**mirror | plain | {"config": config_class(plain["algo"])(**plain["config"]), "runs_dir": runs_dir})
 
 
 def digest(path: Path) -> str:

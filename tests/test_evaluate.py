@@ -121,3 +121,11 @@ def test_what_is_no_finished_run_is_not_exported(trained, tmp_path, capsys):
     assert "is no run folder" in errors[0]
     assert "only finished runs are exported" in errors[1]
     assert not (tmp_path / "out").exists()
+
+
+def test_a_run_folder_from_before_the_mirror_had_settings_can_be_read(trained, tmp_path):
+    text = trained["ppo"].to_yaml()
+    older = "".join(line for line in text.splitlines(keepends=True) if not line.startswith("wandb_project"))
+    assert older != text
+    (tmp_path / "config.yaml").write_text(older)
+    assert evaluate.load_run(tmp_path).run_id == trained["ppo"].run_id
