@@ -23,8 +23,8 @@ Written by `make results` from the committed rows under `paper_figures/data/`; d
 been trained. `python -m analysis.explain paper_figures/data/laptop/fig3.csv` lists the runs behind a file, and
 [reproduce.md](reproduce.md) says how to train any of them again.
 """
-FINAL = """Return over the last 10 % of iterations, mean ± standard deviation over seeds, and area under the curve (mean return
-over all iterations). With three seeds these decide little: the verdicts below use intervals.
+FINAL = """Return over the last 10 % of iterations, mean ± standard deviation over seeds, and area under the curve (mean
+return over all iterations). With three seeds these decide little: the verdicts below use intervals.
 """
 
 
