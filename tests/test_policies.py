@@ -12,6 +12,7 @@ from hippo.core.policies import (
     SkillLinear,
     SkillPolicy,
     Tanh,
+    affine,
     gaussian_entropy,
     gaussian_log_prob,
     sample_categorical,
@@ -123,3 +124,21 @@ def test_the_numpy_twins_of_manager_and_flat_policy_compute_what_torch_does():
         flat.log_std_parameter.fill_(1.0)
     moved = flat.actor()(obs.numpy(), np.ones((7, 2), np.float32)) - action
     np.testing.assert_allclose(moved, np.full((7, 2), np.e), rtol=1e-5)
+
+
+@pytest.mark.parametrize("rows", [1, 3, 4, 50, 1000])
+@pytest.mark.parametrize(("inputs", "outputs"), [(17, 32), (64, 64), (64, 6), (256, 64), (17, 256)])
+def test_affine_and_its_gradients_are_those_of_float64(rows, inputs, outputs):
+    """Also of a transposed weight and of a strided bias, which oneDNN alone misreads."""
+    x = torch.randn(rows, inputs, generator=generator(), requires_grad=True)
+    weight = torch.randn(inputs, outputs, 3, generator=generator(1), requires_grad=True)
+    bias = torch.randn(outputs, 3, generator=generator(2), requires_grad=True)
+    gradient = torch.randn(rows, outputs, generator=generator(3))
+    y = affine(x, weight[..., 1].T, bias[:, 1])
+    y.backward(gradient)
+    exact = [t.detach().double().requires_grad_() for t in (x, weight, bias)]
+    reference = exact[0] @ exact[1][..., 1] + exact[2][:, 1]
+    reference.backward(gradient.double())
+    torch.testing.assert_close(y.double(), reference, rtol=1e-4, atol=1e-4)
+    for ours, theirs in zip((x, weight, bias), exact, strict=True):
+        torch.testing.assert_close(ours.grad.double(), theirs.grad, rtol=1e-4, atol=5e-4)
