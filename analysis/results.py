@@ -59,7 +59,40 @@ def section(results: Results, pictures: Path) -> list[str]:
             head = f"| {label}, {physics} physics | seeds | steps | final | area |"
             lines += [head, "|---|---|---|---|---|", *rows, ""]
     if results.missing:
-        lines += ["Planned and not there: " + "; ".join(results.missing_lines()) + ".", ""]
+        lines += ["Planned and not trained: " + "; ".join(untrained(results)) + ".", ""]
+    return lines
+
+
+def untrained(results: Results) -> list[str]:
+    """What is missing, an entry per environment."""
+    planned: dict[str, set[str]] = {}
+    for run in results.missing:
+        planned.setdefault(run["env_label"], set()).add(run["variant_label"])
+    everything = {run["env_label"]: set[str]() for run in results.plan["runs"]}
+    for run in results.plan["runs"]:
+        everything[run["env_label"]].add(run["variant_label"])
+    return [
+        f"{env}: {'all' if variants == everything[env] else ', '.join(sorted(variants))}"
+        for env, variants in planned.items()
+    ]
+
+
+def table_section(results: Results) -> list[str]:
+    """One table of the paper: the mean over seeds of every quantity, as measured."""
+    plan = results.plan
+    lines = [f"## {plan['title']} ({plan['figure']}, {plan['scale']} scale)", ""]
+    labels = {(run["env"], run["variant"]): f"{run['env_label']}, {run['variant_label']}" for run in plan["runs"]}
+    shown = {
+        key: label for key, label in labels.items() if key in set(results.frame.groupby(["env", "variant"]).groups)
+    }
+    lines += [f"| mean over seeds | {' | '.join(shown.values())} |", "|---|" + "---|" * len(shown)]
+    means = results.frame.groupby(["metric", "env", "variant"])["value"].mean()
+    for metric, values in means.groupby("metric", sort=False):
+        cells = [f"{values[metric, env, variant]:.3g}" for env, variant in shown]
+        lines.append(f"| {metric} | {' | '.join(cells)} |")
+    seeds = results.frame.groupby(["env", "variant"])["seed"].nunique()
+    command = f"`make {plan['figure']} SCALE={plan['scale']}`"
+    lines += ["", f"{seeds.min()} seeds. {command} names each definition and puts the paper's values beside it.", ""]
     return lines
 
 
@@ -95,6 +128,9 @@ def page(runs_dir: Path, data: Path, pictures: Path) -> str:
             lines.append(FINAL)
         for each in curves.values():
             lines += section(each, pictures)
+        for name, each in results.items():
+            if name not in curves:
+                lines += table_section(each)
         if results:
             lines += verdicts(scale, results)
     if len(lines) == 1:
