@@ -57,6 +57,12 @@ class Plan:
             return []
         return [parent, *self._missing_ancestors(parent)]
 
+    def only(self, run_ids: Sequence[str]) -> "Plan":
+        """The same plan with no other entries; ConfigError for a run that is not in it."""
+        for run_id in run_ids:
+            check_choice("only", run_id, [e.run.run_id for e in self.entries])
+        return dataclasses.replace(self, entries=[e for e in self.entries if e.run.run_id in run_ids])
+
     def write(self, runs_dir: Path) -> Path:
         """Write the plan for analysis and drawing, which read nothing else but run folders and committed rows."""
         path = runs_dir / "plans" / self.scale / f"{self.figure}.json"

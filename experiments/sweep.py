@@ -162,6 +162,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--wait", action="store_true", help="slurm: return when the jobs have ended, not at once")
     parser.add_argument("--runs-dir", type=Path, default=Path("runs"))
     parser.add_argument("--fresh", action="store_true", help="ignore committed results")
+    parser.add_argument("--only", action="append", metavar="RUN_ID", help="nothing but this run and what it needs")
     parser.add_argument("--max-core-hours", type=float, default=100.0, help="refuse to start more than this")
     parser.add_argument("--yes", action="store_true", help="start it all the same")
     parser.add_argument("--write", action="store_true", help="plan: also write the plans that drawing reads")
@@ -175,7 +176,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parse(arguments)
 
     def plan_of(figure: str) -> Plan:
-        return make_plan(figure, options.scale, options.set, options.fresh, options.runs_dir)
+        plan = make_plan(figure, options.scale, options.set, options.fresh, options.runs_dir)
+        return plan.only(options.only) if options.only else plan
 
     try:
         check_options(options)

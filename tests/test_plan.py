@@ -73,6 +73,19 @@ def test_a_figure_leaves_out_environments_and_gives_others_their_own_settings(tm
     assert written["not_trained"] == [{"env": "snake_gather", "env_label": "Snake Gather"}]
 
 
+def test_one_run_of_a_figure_can_be_picked_and_brings_what_it_needs(tmp_path, capsys):
+    arguments = ["run", "two", "--runs-dir", str(tmp_path), *(f"--set={s}" for s in SETTINGS)]
+    wanted, other = (e.run for e in make_plan("two", "smoke", SETTINGS, False, tmp_path).entries)
+    assert sweep.main([*arguments, "--only", wanted.run_id]) == 0
+    assert wanted.parent is not None
+    done = {path.parent.name for path in tmp_path.glob("*/status.json")}
+    assert done == {wanted.run_id, wanted.parent.run_id}
+    assert sweep.main([*arguments, "--only", "nonsense"]) == 2
+    error = capsys.readouterr().err
+    assert "only=nonsense" in error
+    assert other.run_id in error
+
+
 def test_an_evaluation_depends_on_the_trained_run_of_another_figure(tmp_path):
     one, two = plan("one", tmp_path), plan("two", tmp_path)
     parents = [e.run.parent for e in two.entries]
