@@ -69,9 +69,18 @@ def run_figure(plan: Plan, todo: Sequence[Run], train: TrainAll, runs_dir: Path)
         )
 
     terminal = sys.stdout.isatty()
+    stopping = False
+
+    def stop(_signal: int, _frame: object) -> None:
+        """Ctrl-C and SIGTERM alike: every run stays resumable."""
+        nonlocal stopping
+        stopping = True
+        raise KeyboardInterrupt
 
     def report(running: int, ended: int) -> None:
         nonlocal last_report
+        if stopping:  # an exception raised inside a finaliser is lost; the flag is not
+            raise KeyboardInterrupt
         if time.monotonic() - last_report < (1.0 if terminal else REPORT_SECONDS):
             return
         last_report = time.monotonic()
@@ -80,12 +89,15 @@ def run_figure(plan: Plan, todo: Sequence[Run], train: TrainAll, runs_dir: Path)
         line = f"[{ended}/{len(todo)}] {running} running, elapsed {clock(elapsed)}, ETA {eta}"
         print(f"\r{line}\x1b[K" if terminal else line, end="" if terminal else "\n", flush=True)
 
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C: every run stays resumable
+    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         states = train(todo, report)
     except KeyboardInterrupt:
         print("\nstopped; the same command continues where it left off", file=sys.stderr)
         return EXIT_REQUEUE
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
     for entry in plan.entries:
         entry.state = states.get(entry.run.run_id, entry.state)
     plan.write(runs_dir)

@@ -1,5 +1,6 @@
 """One run from the command line, sweeps in the local pool, and what both refuse."""
 
+import contextlib
 import json
 import os
 import re
@@ -15,7 +16,7 @@ import pytest
 
 from experiments import costs, launchers, sweep, train
 from experiments.config import COMMITTED, Run, compose_run
-from experiments.plan import committed_runs, make_plan
+from experiments.plan import Plan, committed_runs, make_plan
 from experiments.status import Status, read_status
 from hippo.core.checkpoint import load
 
@@ -371,6 +372,23 @@ def test_ctrl_c_leaves_every_run_resumable_and_no_orphan(tmp_path):
     assert states
     assert {s["state"] for s in states} == {"preempted"}
     assert not any(Path(f"/proc/{s['pid']}").exists() for s in states)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_stop_whose_exception_was_lost_is_heard_at_the_next_report(number, tmp_path, capsys):
+    handler = signal.getsignal(number)
+
+    def train(_todo, report):
+        with contextlib.suppress(KeyboardInterrupt):  # as Python does when a finaliser raises
+            os.kill(os.getpid(), number)
+        for _ in range(3):
+            report(0, 0)
+        return {}
+
+    plan = Plan("fig3", "smoke", {}, fresh=True, entries=[])
+    assert sweep.run_figure(plan, [], train, tmp_path) == 75
+    assert "the same command continues" in capsys.readouterr().err
+    assert signal.getsignal(number) is handler
 
 
 def test_every_committed_row_belongs_to_a_run_that_its_plan_still_yields():
