@@ -62,6 +62,25 @@ def test_a_wall_pays_once_in_order_and_also_several_in_one_step():
     assert driven([1.5, 1.56], "half_cheetah") == [0, 1]  # its first far face is at 1.55
 
 
+@pytest.mark.parametrize("name", ["block_hopper", "block_half_cheetah"])
+def test_a_step_puts_the_ring_where_its_definition_says_and_only_where_a_wall_was_passed_or_left_behind(name):
+    env, rng = make(name, 100, 0), np.random.default_rng(0)
+    env.reset(seed=0)
+    task, boxes = env.task, env.physics.mocap_pos
+    for x in rng.uniform(-3, 30, (20, 100)) + np.arange(20)[:, None] * 60:  # beyond the 512 heights too
+        boxes[:, :, 1] = 7.0  # a mark
+        before = task.ahead.copy()
+        task.com[:, 0] = np.where(rng.random(100) < 0.5, x, task.com[:, 0])
+        task.step()
+        expected = blocks.ring_positions(blocks.ring_indices(task.ahead), task.heights, task.track)
+        assert np.array_equal(task.ahead, blocks.next_wall(task.com[:, 0], task.track))
+        turned = task.ahead != before
+        assert 0 < turned.sum() < 100
+        assert np.array_equal(boxes[turned], expected[turned])
+        assert np.array_equal(boxes[~turned][:, :, [0, 2]], expected[~turned][:, :, [0, 2]])
+        assert (boxes[~turned][:, :, 1] == 7.0).all()
+
+
 @pytest.mark.parametrize(("name", "first_wall"), [("block_hopper", 2.0), ("block_half_cheetah", 1.5)])
 def test_a_probe_dropped_on_every_wall_rests_at_its_drawn_height(name, first_wall):
     """Also after a second reset and after the ring has turned."""

@@ -31,6 +31,17 @@ def slow_lidar(com, yaw, objects, present):
     return out
 
 
+def vectorised_lidar(com, yaw, objects, present):
+    """All robots and objects at once by numpy, whose every bit the kernel must give."""
+    offset = objects - com[:, None]
+    reading = np.where(present, np.maximum(1 - np.sqrt((offset * offset).sum(-1)) / 6, 0), 0)
+    turn = (np.arctan2(offset[..., 1], offset[..., 0]) - yaw[:, None] + np.pi) % (2 * np.pi)
+    bins = np.where(turn == 0, 9, np.minimum((turn * (10 / (2 * np.pi))).astype(int), 9))
+    out = np.zeros((len(com), 20))
+    np.maximum.at(out, (np.arange(len(com))[:, None], bins + np.repeat([0, 10], 8)), reading)
+    return out
+
+
 def scene(*objects, yaw=0.0):
     """Lidar of one robot at the origin; `objects` are (kind, x, y)."""
     positions, present = np.zeros((1, 16, 2)), np.zeros((1, 16), bool)
@@ -49,6 +60,21 @@ def test_lidar_equals_a_slow_loop_on_random_scenes():
     slow = np.array([slow_lidar(*each) for each in zip(com, yaw, objects, present, strict=True)])
     np.testing.assert_allclose(fast, slow, rtol=0, atol=1e-12)
     assert (gather.lidar(com, yaw + math.pi, objects, present) != slow).any()  # bins counted from ahead
+
+
+def test_lidar_has_the_bits_of_numpy_also_where_bins_meet():
+    rng, n = np.random.default_rng(1), 20_000
+    objects, present = rng.uniform(-7, 7, (n, 16, 2)), rng.random((n, 16)) < 0.9
+    com, yaw = rng.uniform(-6, 6, (n, 2)), rng.uniform(-20, 20, n)
+    # Robots on the cells, turned by multiples of 18 degrees: objects on the borders of bins and exactly behind.
+    com[::2], objects[::2], yaw[::2] = (
+        np.rint(com[::2]),
+        np.rint(objects[::2]),
+        rng.integers(-40, 40, n // 2) * np.pi / 10,
+    )
+    fast = gather.lidar(com, yaw, objects, present)
+    assert fast.tobytes() == vectorised_lidar(com, yaw, objects, present).tobytes()
+    assert (fast > 0).mean() > 0.2
 
 
 def test_bins_start_straight_behind_and_go_counter_clockwise():
@@ -91,6 +117,30 @@ def test_objects_are_caught_within_one_metre_exclusive():
     gone = np.ones((1, 16), bool)
     gone[0, 1] = False
     assert not gather.catch(np.zeros((1, 2)), objects, gone)[0, 1]
+
+
+def test_an_ant_is_dead_outside_its_heights_and_at_none():
+    heights = np.array([0.3, 1.0, math.nextafter(0.3, 0), math.nextafter(1.0, 2), math.nan, math.inf, -math.inf])
+    assert gather.dead(heights).tolist() == [False, False, True, True, True, True, True]
+
+
+@pytest.mark.parametrize("name", ["ant_gather", "snake_gather"])
+def test_a_step_pays_for_and_removes_what_catch_says_unless_the_robot_is_dead(name):
+    env, rng, n = make(name, 500, 0), np.random.default_rng(3), 500
+    task = env.task
+    task.objects[:], task.present[:] = rng.uniform(-2, 2, (n, 16, 2)), rng.random((n, 16)) < rng.random((n, 1))
+    env.physics.qpos[:, 2] = rng.uniform(0.2, 1.1, n)
+    present = task.present.copy()
+    caught = gather.catch(task.com, task.objects, present)
+    reward, terminated, terms = task.step()
+    dies = (name == "ant_gather") & gather.dead(env.physics.qpos[:, 2])
+    pay = caught[:, :8].sum(1) - caught[:, 8:].sum(1)
+    assert np.array_equal(task.present, present & ~caught)
+    assert np.array_equal(reward, np.where(dies, -10.0, pay))
+    assert np.array_equal(terms["reward_objects"], np.where(dies, 0.0, pay))
+    assert np.array_equal(terminated, dies | ~task.present.any(1))
+    assert caught.sum() > 100
+    assert terminated.sum() > 5
 
 
 def test_placement_uses_distinct_cells_off_the_origin():

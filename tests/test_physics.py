@@ -1,11 +1,13 @@
 """BatchPhysics: exactly a plain `mj_step` loop, current derived fields, and contained divergence."""
 
+import warnings
+
 import mujoco
 import numpy as np
 import pytest
 
 from hippo.envs import ENVIRONMENTS, make
-from hippo.envs.mass_centre import MassCentre, hopper_features
+from hippo.envs.mass_centre import MassCentre, ant_features, hopper_features
 
 STEPS = {"ant": 60, "snake": 10, "hopper": 150, "cheetah": 100}
 
@@ -123,6 +125,41 @@ def test_a_diverged_simulation_ends_alone(name, bad):
     assert np.isfinite(info["final_obs"]).all()
     assert info["_final_obs"].tolist() == [False, False, True, False]
     assert not np.array_equal(clean[6][0][2], injected[6][0][2])
+
+
+def test_one_bad_number_anywhere_is_a_divergence_and_a_large_position_is_none():
+    env = make("ant_gather", 4, 0)
+    env.reset(seed=0)
+    physics, which = env.physics, np.empty(4, bool)
+    assert not physics.diverged(which)
+    assert which.tolist() == [False] * 4
+    for field, values in ((physics.qpos, [np.nan, np.inf, -np.inf]), (physics.qvel, [np.nan, np.inf, 10001, -10001])):
+        for j in range(field.shape[1]):
+            for value in values:
+                kept, field[2, j] = field[2, j], value
+                assert physics.diverged(which)
+                assert which.tolist() == [False, False, True, False]
+                field[2, j] = kept
+    physics.qpos[1], physics.qvel[3] = 1e9, -1e4
+    assert not physics.diverged(which)
+
+
+def test_features_of_the_centre_of_mass_worked_by_numpy_and_without_a_warning_of_infinity():
+    qpos = np.random.default_rng(0).normal(size=(40, 15)) * 3
+    sin, cos = np.sin(qpos[:, 7:]), np.cos(qpos[:, 7:])
+    hips, ankles = slice(0, None, 2), slice(1, None, 2)
+    legs = [sin[:, hips], cos[:, hips], sin[:, hips] * cos[:, ankles], cos[:, hips] * cos[:, ankles], sin[:, ankles]]
+    assert np.array_equal(ant_features(qpos), np.concatenate([np.ones((40, 1)), *legs], 1))
+    pitch, thigh, leg, foot = qpos.T[2:6]
+    angles = np.stack([pitch, pitch - thigh, pitch - thigh - leg, pitch - thigh - leg - foot], 1)
+    chain = np.concatenate([np.ones((40, 1)), qpos[:, :2], np.sin(angles), np.cos(angles)], 1)
+    assert np.array_equal(hopper_features(qpos[:, :6]), chain)
+    qpos[3, 3:] = np.inf
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for features, columns in ((ant_features, 15), (hopper_features, 6)):
+            assert np.isnan(features(qpos[:, :columns])[3]).any()
+            assert np.isfinite(np.delete(features(qpos[:, :columns]), 3, 0)).all()
 
 
 @pytest.mark.parametrize("name", ["ant_gather", "block_hopper"])

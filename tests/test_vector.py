@@ -4,7 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from hippo.envs import ENVIRONMENTS, make
+from hippo.envs import ENVIRONMENTS, blocks, gather, locomote, make, mass_centre, physics, robots, vector
 
 everywhere = pytest.mark.parametrize("name", ENVIRONMENTS)
 
@@ -207,6 +207,40 @@ def test_actions_are_clipped_and_mapped_to_the_controls():
     env.reset(seed=0)
     env.step(np.array([[0.5, -2.0, 1.0], [0.0, 1.5, -0.25]]))
     assert env.physics.ctrl.tolist() == [[100, -200, 200], [0, 200, -50]]
+
+
+def test_an_observation_is_its_sources_as_single_floats_within_their_bounds_and_nan_stays():
+    sources = [np.array([[0.1, -1e30, np.nan]]), np.array([[7.0, 2.0]]), np.zeros((1, 3)), np.array([[0.0, 5.5]])]
+    picks = [(0, 0), (0, 1), (0, 2), (1, 1), (2, 2), (3, 1)]
+    low, high = np.full(6, -1.0, np.float32), np.full(6, 4.0, np.float32)
+    out = np.empty((1, 6), np.float32)
+    vector._fill(*sources, *np.array(picks).T.copy(), low, high, out)
+    np.testing.assert_array_equal(out, np.array([[0.1, -1.0, np.nan, 2.0, 0.0, 4.0]], np.float32))
+
+
+@everywhere
+def test_nothing_is_compiled_but_for_one_and_for_many_simulations_however_the_actions_come(name):
+    def compiled():
+        modules = (vector, physics, mass_centre, robots, gather, blocks, locomote)
+        kernels = [(f"{m.__name__}.{n}", k) for m in modules for n, k in vars(m).items() if hasattr(k, "signatures")]
+        assert len(kernels) > 15
+        return {name: list(kernel.signatures) for name, kernel in kernels}
+
+    def step(num_envs):
+        env = make(name, num_envs, 0, horizon=3)
+        env.reset(seed=0)
+        moves = actions(env, 1)[0]
+        frozen, wide = moves.copy(), np.repeat(moves, 2, 1)
+        frozen.flags.writeable = False
+        for a in (moves, moves.astype(np.float32), moves.tolist(), np.asfortranarray(moves), frozen, wide[:, ::2]):
+            env.step(a)
+
+    step(1)
+    step(2)
+    once = compiled()
+    step(1)
+    step(5)
+    assert compiled() == once
 
 
 @pytest.mark.parametrize(

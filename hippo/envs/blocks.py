@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import mujoco
+import numba
 import numpy as np
 
 from hippo.envs.physics import BatchPhysics
@@ -41,8 +42,22 @@ def draw_heights(rng: np.random.Generator, track: Track) -> np.ndarray:
 
 def next_wall(x: np.ndarray, track: Track) -> np.ndarray:
     """Index (N,) of the first wall whose far face lies ahead of x (N,); every wall before it is passed."""
-    passed = np.ceil((x - (track.first_wall + LENGTH / 2)) / SPACING)
-    return np.maximum(passed, 0).astype(np.int64)
+    out = np.empty(len(x), np.int64)
+    _next_wall(x, track.first_wall, out)
+    return out
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _next_wall(x: np.ndarray, first_wall: float, out: np.ndarray) -> None:
+    """Write `next_wall` to out (N,) int64."""
+    for i in range(len(x)):
+        out[i] = _passed(x[i], first_wall)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _passed(x: float, first_wall: float) -> int:
+    """How many walls' far faces lie behind x."""
+    return int(max(np.ceil((x - (first_wall + LENGTH / 2)) / SPACING), 0.0))
 
 
 def wall_x(index: np.ndarray, track: Track) -> np.ndarray:
@@ -73,14 +88,51 @@ def observe(x: np.ndarray, ahead: np.ndarray, heights: np.ndarray, track: Track)
 
     The previous wall is zeros before the first.
     """
-    out, rows = np.empty((len(x), 8)), np.arange(len(x))
-    for column, index in ((0, ahead), (4, ahead - 1)):
-        out[:, column] = heights[rows, index % NUM_HEIGHTS]
-        out[:, column + 1] = LENGTH
-        out[:, column + 2] = centre = wall_x(index, track)
-        out[:, column + 3] = centre - x
-    out[ahead == 0, 4:] = 0.0
+    out = np.zeros((len(x), 8))
+    _observe(x, ahead, heights, track.first_wall, out)
     return out
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _observe(x: np.ndarray, ahead: np.ndarray, heights: np.ndarray, first_wall: float, out: np.ndarray) -> None:
+    """Write `observe` to out (N, 8), which holds zeros."""
+    for i in range(len(x)):
+        for column, index in ((0, ahead[i]), (4, ahead[i] - 1)):
+            if index >= 0:
+                centre = first_wall + SPACING * index
+                out[i, column] = heights[i, index % NUM_HEIGHTS]
+                out[i, column + 1] = LENGTH
+                out[i, column + 2] = centre
+                out[i, column + 3] = centre - x[i]
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _run(
+    x: np.ndarray,
+    heights: np.ndarray,
+    first_wall: float,
+    ahead: np.ndarray,
+    cleared: np.ndarray,
+    boxes: np.ndarray,
+    reward: np.ndarray,
+) -> None:
+    """One step of the task with the robots at x (N,).
+
+    Updates ahead (N,), the walls passed now, and cleared (N,), the most ever, whose growth is the reward (N,). Where
+    `ahead` changes, the ring turns: boxes (N, W, 3) become `ring_positions` of `ring_indices`.
+    """
+    for i in range(len(x)):
+        passed = _passed(x[i], first_wall)
+        if passed != ahead[i]:
+            ahead[i] = passed
+            start = max(passed - BEHIND, 0)
+            for slot in range(RING):
+                wall = start + (slot - start) % RING
+                boxes[i, slot, 0] = first_wall + SPACING * wall
+                boxes[i, slot, 1] = 0.0
+                boxes[i, slot, 2] = heights[i, wall % NUM_HEIGHTS] - HALF_HEIGHT
+        reward[i] = max(passed - cleared[i], 0)
+        cleared[i] = max(passed, cleared[i])
 
 
 class Blocks:
@@ -128,23 +180,14 @@ class Blocks:
         for i, rng in zip(ids, layouts, strict=True):
             self.heights[i] = draw_heights(rng, self.track)
         self.cleared[ids] = self.ahead[ids] = 0
-        self._raise_walls(ids)
-
-    def _raise_walls(self, ids: np.ndarray) -> None:
         index = ring_indices(self.ahead[ids])
         self.physics.mocap_pos[ids] = ring_positions(index, self.heights[ids], self.track)
 
     def step(self) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
         """Reward (N,), terminated (N,) and the reward's terms, read from the new state."""
         x = self.com[:, 0]
-        ahead = next_wall(x, self.track)
-        moved = np.flatnonzero(ahead != self.ahead)
-        self.ahead = ahead
-        if len(moved):
-            self._raise_walls(moved)
-        cleared = np.maximum(self.cleared, ahead)
-        reward = (cleared - self.cleared).astype(np.float64)
-        self.cleared = cleared
+        reward, boxes = np.empty(len(x)), self.physics.mocap_pos
+        _run(x, self.heights, self.track.first_wall, self.ahead, self.cleared, boxes, reward)
         terminated = self._fallen() if self.terminate_on_fall else np.zeros(len(x), bool)
         return reward.copy(), terminated, {"reward_walls": reward}
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import mujoco
+import numba
 import numpy as np
 
 from hippo.envs.physics import BatchPhysics
@@ -32,7 +33,24 @@ class VelocityPenalty:
 
     def __call__(self, speed: np.ndarray) -> np.ndarray:
         """Speed (N,) in m/s -> penalty (N,) >= 0."""
-        return np.where(speed <= self.threshold, 0.0, self.bias + self.slope * (speed - self.threshold))
+        out = np.empty(len(speed))
+        _penalise(speed, self.threshold, self.slope, self.bias, out)
+        return out
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _penalise(speed: np.ndarray, threshold: float, slope: float, bias: float, out: np.ndarray) -> None:
+    """Write `VelocityPenalty` to out (N,)."""
+    for i in range(len(speed)):
+        out[i] = 0.0 if speed[i] <= threshold else bias + slope * (speed[i] - threshold)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _norm(velocity: np.ndarray, speed: np.ndarray) -> None:
+    """Write the lengths of velocity (N, 3) to speed (N,)."""
+    for i in range(len(speed)):
+        vx, vy, vz = velocity[i, 0], velocity[i, 1], velocity[i, 2]
+        speed[i] = np.sqrt(vx * vx + vy * vy + vz * vz)
 
 
 PENALTIES = {"ant": VelocityPenalty(1.2, 0.0025, 0.001), "snake": VelocityPenalty(0.111, 0.0005, 0.001)}
@@ -55,8 +73,25 @@ def place(rng: np.random.Generator, points: np.ndarray) -> np.ndarray:
 
 def catch(com: np.ndarray, objects: np.ndarray, present: np.ndarray) -> np.ndarray:
     """Which objects are caught: centre of mass (N, 2), objects (N, O, 2), present (N, O) -> (N, O) bool."""
-    offset = objects - com[:, None]
-    return present & ((offset * offset).sum(-1) < CATCH_DISTANCE**2)
+    assert objects.shape[:2] == present.shape == (len(com), NUM_OBJECTS)
+    caught = np.empty(present.shape, bool)
+    _catch(com, objects, present, caught)
+    return caught
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _in_reach(com: np.ndarray, objects: np.ndarray, i: int, o: int) -> bool:
+    """Whether object o of robot i is near enough to be caught."""
+    dx, dy = objects[i, o, 0] - com[i, 0], objects[i, o, 1] - com[i, 1]
+    return dx * dx + dy * dy < CATCH_DISTANCE**2
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _catch(com: np.ndarray, objects: np.ndarray, present: np.ndarray, caught: np.ndarray) -> None:
+    """Write `catch` to caught (N, O) bool."""
+    for i in range(len(com)):
+        for o in range(NUM_OBJECTS):
+            caught[i, o] = present[i, o] and _in_reach(com, objects, i, o)
 
 
 def lidar(com: np.ndarray, yaw: np.ndarray, objects: np.ndarray, present: np.ndarray) -> np.ndarray:
@@ -71,23 +106,77 @@ def lidar(com: np.ndarray, yaw: np.ndarray, objects: np.ndarray, present: np.nda
     Returns:
         (N, 20): ten apple bins, ten bomb bins.
     """
-    offset = objects - com[:, None]
-    distance = np.sqrt((offset * offset).sum(-1))  # (N, O)
-    reading = np.where(present, np.maximum(1 - distance / SENSOR_RANGE, 0.0), 0.0)
-    behind = np.arctan2(offset[..., 1], offset[..., 0]) - yaw[:, None] + np.pi
-    turn = behind % (2 * np.pi)
-    bins = np.minimum((turn * (NUM_BINS / (2 * np.pi))).astype(np.int64), NUM_BINS - 1)
-    bins[turn == 0] = NUM_BINS - 1
-    N = len(com)
-    out = np.zeros(N * 2 * NUM_BINS)
-    kind = np.arange(NUM_OBJECTS) // NUM_APPLES * NUM_BINS
-    np.maximum.at(out, (bins + kind + (np.arange(N) * 2 * NUM_BINS)[:, None]).ravel(), reading.ravel())
-    return out.reshape(N, 2 * NUM_BINS)
+    assert objects.shape[:2] == present.shape == (len(com), NUM_OBJECTS)
+    out = np.zeros((len(com), 2 * NUM_BINS))
+    _lidar(com, yaw, objects, present, out)
+    return out
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _lidar(com: np.ndarray, yaw: np.ndarray, objects: np.ndarray, present: np.ndarray, out: np.ndarray) -> None:
+    """Write `lidar` to out (N, 20), which holds zeros."""
+    for i in range(len(com)):
+        for o in range(NUM_OBJECTS):
+            dx, dy = objects[i, o, 0] - com[i, 0], objects[i, o, 1] - com[i, 1]
+            reading = 1 - np.sqrt(dx * dx + dy * dy) / SENSOR_RANGE
+            if not (present[i, o] and reading > 0):
+                continue
+            # Only the bin depends on this arctan2, so another last bit of it than numpy's would not show in a reading.
+            turn = (np.arctan2(dy, dx) - yaw[i] + np.pi) % (2 * np.pi)
+            slot = NUM_BINS - 1
+            if 0 < turn < 2 * np.pi:
+                slot = min(int(turn * (NUM_BINS / (2 * np.pi))), NUM_BINS - 1)
+            if o >= NUM_APPLES:
+                slot += NUM_BINS
+            out[i, slot] = max(out[i, slot], reading)
 
 
 def dead(z: np.ndarray) -> np.ndarray:
     """Whether an Ant at height z (N,) in m is: too low, too high or nowhere."""
-    return ~((z >= 0.3) & (z <= 1.0))
+    out = np.empty(len(z), bool)
+    _dead(z, out)
+    return out
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _is_dead(z: float) -> bool:
+    return not 0.3 <= z <= 1.0  # NaN compares false
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _dead(z: np.ndarray, out: np.ndarray) -> None:
+    """Write `dead` to out (N,) bool."""
+    for i in range(len(z)):
+        out[i] = _is_dead(z[i])
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _collect(
+    com: np.ndarray,
+    z: np.ndarray,
+    is_mortal: bool,
+    objects: np.ndarray,
+    present: np.ndarray,
+    for_objects: np.ndarray,
+    for_death: np.ndarray,
+    reward: np.ndarray,
+    terminated: np.ndarray,
+) -> None:
+    """One step of the task: take what is caught from present (N, O), write what is paid for what, and the ends (N,).
+
+    com (N, 2), z (N,) heights at which mortal robots may be dead: that costs DEATH_REWARD and nothing else is paid.
+    """
+    for i in range(len(com)):
+        for_objects[i], for_death[i], terminated[i] = 0.0, 0.0, True
+        for o in range(NUM_OBJECTS):
+            if present[i, o] and _in_reach(com, objects, i, o):
+                for_objects[i] += VALUE[o]
+                present[i, o] = False
+            elif present[i, o]:
+                terminated[i] = False
+        if is_mortal and _is_dead(z[i]):
+            for_objects[i], for_death[i], terminated[i] = 0.0, DEATH_REWARD, True
+        reward[i] = for_objects[i] + for_death[i]
 
 
 class Gather:
@@ -99,7 +188,7 @@ class Gather:
         self.robot, self.num_envs = robot, num_envs
         self.cells = cells(options.grid)
         self.penalty = PENALTIES[robot.name] if options.velocity_penalty else None
-        self.position = options.position
+        self.position, self.is_mortal = options.position, robot.name == "ant"
         self.has_walls = options.walls or robot.name == "ant"
         self.objects = np.zeros((num_envs, NUM_OBJECTS, 2))  # (N, O, 2) m
         self.present = np.zeros((num_envs, NUM_OBJECTS), bool)  # (N, O) not caught yet
@@ -129,7 +218,7 @@ class Gather:
     def attach(self, physics: BatchPhysics) -> None:
         """Take views of what the task reads from the simulations."""
         self.physics = physics
-        self.com = physics.com
+        self.com, self.z = physics.com[:, :2], physics.qpos[:, 2]
         self.com_velocity = physics.bind("sensordata") if self.penalty is not None else None
 
     @property
@@ -146,20 +235,20 @@ class Gather:
 
     def step(self) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
         """Reward (N,), terminated (N,) and the reward's terms, read from the new state."""
-        caught = catch(self.com[:, :2], self.objects, self.present)
-        self.present &= ~caught
-        reward = caught @ VALUE
-        terminated = np.asarray(~self.present.any(1))
-        terms = {"reward_objects": reward}
-        if self.robot.name == "ant":
-            is_dead = dead(self.physics.qpos[:, 2])
-            terms["reward_objects"] = np.where(is_dead, 0.0, reward)
-            terms["reward_death"] = np.where(is_dead, DEATH_REWARD, 0.0)
-            terminated = terminated | is_dead
+        N = self.num_envs
+        for_objects, for_death, reward, terminated = np.empty(N), np.empty(N), np.empty(N), np.empty(N, bool)
+        state, paid = (self.com, self.z, self.is_mortal, self.objects, self.present), (for_objects, for_death, reward)
+        _collect(*state, *paid, terminated)
+        terms = {"reward_objects": for_objects}
+        if self.is_mortal:
+            terms["reward_death"] = for_death
         if self.penalty is not None:
             assert self.com_velocity is not None
-            terms["velocity_penalty"] = self.penalty(np.linalg.norm(self.com_velocity, axis=1))
-        return _total(terms), terminated, terms
+            speed = np.empty(N)
+            _norm(self.com_velocity, speed)
+            terms["velocity_penalty"] = self.penalty(speed)
+            reward -= terms["velocity_penalty"]
+        return reward, terminated, terms
 
     def observe(self) -> np.ndarray:
         """(N, 20) lidar readings, then with `position` the torso's x and y."""
@@ -169,15 +258,9 @@ class Gather:
     def readings(self) -> np.ndarray:
         """(N, 20) lidar readings."""
         assert self.robot.yaw is not None
-        return lidar(self.com[:, :2], self.robot.yaw(self.physics.qpos), self.objects, self.present)
+        return lidar(self.com, self.robot.yaw(self.physics.qpos), self.objects, self.present)
 
     @property
     def state(self) -> dict[str, np.ndarray]:
         """The arrays that a continuation needs."""
         return {"objects": self.objects, "present": self.present}
-
-
-def _total(terms: dict[str, np.ndarray]) -> np.ndarray:
-    """The reward: its terms summed, the penalty subtracted."""
-    reward = sum(value for name, value in terms.items() if name != "velocity_penalty")
-    return np.asarray(reward - terms.get("velocity_penalty", 0.0))

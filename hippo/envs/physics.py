@@ -1,12 +1,28 @@
 """BatchPhysics: many simulations of one compiled model, a thin adapter over mujoco.batch.Batch."""
 
 import mujoco
+import numba
 import numpy as np
 from mujoco.batch import Batch
 
 from hippo.envs.mass_centre import MassCentre
 
 MAX_SPEED = 1e4  # |qvel| beyond this, in m/s or rad/s, is a diverged simulation (ours)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _diverged(qpos: np.ndarray, qvel: np.ndarray, out: np.ndarray) -> bool:
+    """Write to out (N,) which of qpos (N, nq) are not finite or qvel (N, nv) beyond MAX_SPEED, and return if any is."""
+    any_diverged = False
+    for i in range(len(out)):
+        fine = True
+        for j in range(qpos.shape[1]):
+            fine &= np.isfinite(qpos[i, j])
+        for j in range(qvel.shape[1]):
+            fine &= abs(qvel[i, j]) <= MAX_SPEED  # NaN compares false
+        out[i] = not fine
+        any_diverged |= not fine
+    return any_diverged
 
 
 class BatchPhysics:
@@ -32,13 +48,14 @@ class BatchPhysics:
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         self.model, self.num_envs, self.frame_skip = model, num_envs, frame_skip
         self._mass_centre = mass_centre
-        self._stage = mujoco.mjtStage.mjSTAGE_VEL if mass_centre is None else mujoco.mjtStage.mjSTAGE_NONE
+        stage = mujoco.mjtStage.mjSTAGE_VEL if mass_centre is None else mujoco.mjtStage.mjSTAGE_NONE
+        self._stage = stage.value
         # A persistent batch goes on from the stages computed at the new state, so asking for them costs nothing (but
         # with RK4 it does, see mass_centre.py).
         self._batch = Batch(model, num_envs, num_threads, persistent=mass_centre is None)
         self.qpos, self.qvel = self._batch.bind("qpos"), self._batch.bind("qvel")
         self.ctrl, self.mocap_pos = self._batch.bind("ctrl"), self._batch.bind("mocap_pos")
-        self.com, self._subtree_com = np.zeros((num_envs, 3)), self._batch.bind("subtree_com")
+        self.com, self._subtree_com = np.zeros((num_envs, 3)), self._batch.bind("subtree_com")[:, 1]
         self._initial = np.zeros(self._batch.nstate)
         self._batch.reset(stage=mujoco.mjtStage.mjSTAGE_NONE)
         self._initial[:] = self._batch.state[0]
@@ -63,13 +80,17 @@ class BatchPhysics:
         self._update_com()
 
     def _update_com(self) -> None:
-        with np.errstate(invalid="ignore"):  # a diverged simulation is found by its state
-            self.com[:] = self._subtree_com[:, 1] if self._mass_centre is None else self._mass_centre(self.qpos)
+        if self._mass_centre is None:
+            np.copyto(self.com, self._subtree_com)
+        else:
+            self._mass_centre(self.qpos, out=self.com)
 
-    def diverged(self) -> np.ndarray:
-        """(N,) bool: a position or velocity is not finite, or a velocity is beyond MAX_SPEED."""
-        fine = np.isfinite(self.qpos).all(1) & (np.abs(self.qvel) <= MAX_SPEED).all(1)  # NaN compares false
-        return ~fine
+    def diverged(self, out: np.ndarray) -> bool:
+        """Whether a simulation has a position or velocity that is not finite or a velocity beyond MAX_SPEED.
+
+        Which ones is written to out (N,) bool.
+        """
+        return bool(_diverged(self.qpos, self.qvel, out))
 
     def get_state(self) -> np.ndarray:
         """(N, mj_stateSize(mjSTATE_INTEGRATION)) everything that the continuation depends on, warm start included."""

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import mujoco
+import numba
 import numpy as np
 
 from hippo.envs.mass_centre import Features, ant_features, hopper_features
@@ -64,8 +65,17 @@ class Robot:
 
 def quaternion_yaw(qpos: np.ndarray) -> np.ndarray:
     """Direction of the body's x axis in the plane from the quaternion (w, x, y, z) in qpos[:, 3:7]; (N,) rad."""
-    w, x, y, z = qpos[:, 3], qpos[:, 4], qpos[:, 5], qpos[:, 6]
-    return np.arctan2(2 * (x * y + w * z), w * w + x * x - y * y - z * z)
+    yaw = np.empty(len(qpos))
+    _quaternion_yaw(qpos, yaw)
+    return yaw
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _quaternion_yaw(qpos: np.ndarray, yaw: np.ndarray) -> None:
+    """Write `quaternion_yaw` to yaw (N,)."""
+    for i in range(len(qpos)):
+        w, x, y, z = qpos[i, 3], qpos[i, 4], qpos[i, 5], qpos[i, 6]
+        yaw[i] = np.arctan2(2 * (x * y + w * z), w * w + x * x - y * y - z * z)
 
 
 def _quantity(source: str, index: range | tuple[int, ...], names: str, unit: str, bound: float) -> Quantity:

@@ -1,10 +1,16 @@
-"""RobotTaskEnv: N copies of one robot on one task behind Gymnasium's vector interface, stepped as one batch."""
+"""RobotTaskEnv: N copies of one robot on one task behind Gymnasium's vector interface, stepped as one batch.
+
+What a step does around the physics, here and in the tasks, are kernels compiled by numba: plain loops that write into
+arrays they are given. numpy needs a hundred calls for it, each of them slow while the caches hold MuJoCo's data. Sines,
+cosines and matrix products are left to numpy, so that results have the bits that they had before there were kernels.
+"""
 
 from collections.abc import Sequence
 from typing import Any
 
 import gymnasium as gym
 import mujoco
+import numba
 import numpy as np
 
 from hippo.envs.mass_centre import MassCentre
@@ -15,6 +21,66 @@ from hippo.envs.robots import Robot
 RENDER_MODES = ("rgb_array", "human")
 POSE_NOISE, VELOCITY_NOISE = 0.01, 0.1  # std of the initial qpos and qvel around the model's (rllab)
 RNG_WORDS = 6  # uint64 words that hold one PCG64 generator
+SOURCES = ("qpos", "qvel", "com", "task")  # what observations are made of
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _control(actions: np.ndarray, middle: np.ndarray, half: np.ndarray, ctrl: np.ndarray) -> int:
+    """Write middle + half clip(actions, -1, 1) to ctrl (N, A) unless some actions (N, A) are not finite; how many."""
+    N, A = actions.shape
+    wrong = 0
+    for i in range(N):
+        for j in range(A):
+            wrong += not np.isfinite(actions[i, j])
+    if wrong == 0:
+        for i in range(N):
+            for j in range(A):
+                ctrl[i, j] = middle[j] + half[j] * min(max(actions[i, j], -1.0), 1.0)
+    return wrong
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _truncate(
+    clock: np.ndarray, horizon: int, terminated: np.ndarray, diverged: np.ndarray, truncated: np.ndarray
+) -> bool:
+    """Count a step in clock (N,); truncated (N,): diverged, or at the horizon and not terminated. Whether any ended."""
+    ended = False
+    for i in range(len(clock)):
+        clock[i] += 1
+        truncated[i] = diverged[i] or (clock[i] >= horizon and not terminated[i])
+        ended |= terminated[i] or truncated[i]
+    return ended
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _fill(
+    qpos: np.ndarray,
+    qvel: np.ndarray,
+    com: np.ndarray,
+    task: np.ndarray,
+    source: np.ndarray,
+    column: np.ndarray,
+    low: np.ndarray,
+    high: np.ndarray,
+    out: np.ndarray,
+) -> None:
+    """out (N, D) float32: entry d is column[d] of SOURCES[source[d]], each (N, ...), within low[d] and high[d]."""
+    for i in range(len(out)):
+        for d in range(len(source)):
+            if source[d] == 0:
+                value = qpos[i, column[d]]
+            elif source[d] == 1:
+                value = qvel[i, column[d]]
+            elif source[d] == 2:
+                value = com[i, column[d]]
+            else:
+                value = task[i, column[d]]
+            single = np.float32(value)
+            if single < low[d]:  # NaN stays NaN
+                single = low[d]
+            elif single > high[d]:
+                single = high[d]
+            out[i, d] = single
 
 
 class RobotTaskEnv(gym.vector.VectorEnv):
@@ -67,6 +133,9 @@ class RobotTaskEnv(gym.vector.VectorEnv):
         ]
         self.robot_size = len(entries)
         entries += self.task.entries
+        columns = [(SOURCES.index(q.source), i) for q in self.quantities for i in q.index]
+        columns += [(SOURCES.index("task"), i) for i in range(len(self.task.entries))]
+        self._source, self._column = np.array(columns, np.int64).T.copy()
         self.observation_names = [name for name, *_ in entries]
         self.observation_units = [unit for _, unit, *_ in entries]
         self._low, self._high = (np.array([e[i] for e in entries], np.float32) for i in (2, 3))
@@ -75,7 +144,8 @@ class RobotTaskEnv(gym.vector.VectorEnv):
         self.observation_space = gym.vector.utils.batch_space(self.single_observation_space, num_envs)
         self.action_space = gym.vector.utils.batch_space(self.single_action_space, num_envs)
 
-        self._control_low, self._control_high = model.actuator_ctrlrange.T.copy()
+        control_low, control_high = model.actuator_ctrlrange.T
+        self._middle, self._half = (control_high + control_low) / 2, (control_high - control_low) / 2
         self._qpos = model.key_qpos[0].copy() if model.nkey else model.qpos0.copy()
         self._clock = np.zeros(num_envs, np.int64)
         self._obs = np.zeros((num_envs, len(entries)), np.float32)
@@ -142,32 +212,30 @@ class RobotTaskEnv(gym.vector.VectorEnv):
         self._check_open()
         if not self._started:
             raise gym.error.ResetNeeded("step() before reset(): call reset() first")
-        actions = np.asarray(actions, np.float64)
+        # One type and layout, whatever the caller's, since numba compiles for each.
+        actions = np.array(actions, np.float64, order="C")
         if actions.shape != self.action_space.shape:
             raise ValueError(f"actions have shape {actions.shape}; expected {self.action_space.shape}")
-        if not np.isfinite(actions).all():
-            raise ValueError(f"actions hold {np.count_nonzero(~np.isfinite(actions))} non-finite numbers")
-        middle, half = (self._control_high + self._control_low) / 2, (self._control_high - self._control_low) / 2
-        self.physics.ctrl[:] = middle + half * np.clip(actions, -1.0, 1.0)
+        wrong = _control(actions, self._middle, self._half, self.physics.ctrl)
+        if wrong:
+            raise ValueError(f"actions hold {wrong} non-finite numbers")
         com_before = self.com.copy()
         self.physics.step()
-        self._clock += 1
 
-        diverged = self.physics.diverged()
-        if diverged.any():  # these simulations end here; the task must not read what is not finite
+        diverged, truncated = np.empty(self.num_envs, bool), np.empty(self.num_envs, bool)
+        any_diverged = self.physics.diverged(diverged)
+        if any_diverged:  # these simulations end here; the task must not read what is not finite
             self._pose(np.flatnonzero(diverged))
         reward, terminated, info = self.task.step()
-        if diverged.any():
+        com, obs = self.com.copy(), self._observe()
+        if any_diverged:
             reward, terminated = np.where(diverged, 0.0, reward), terminated & ~diverged
             info = {name: np.where(diverged, 0.0, term) for name, term in info.items()}
-        truncated = ((self._clock >= self.horizon) & ~terminated) | diverged
-        info |= {"diverged": diverged, "com": np.where(diverged[:, None], com_before, self.com)}
-
-        obs = self._observe()
-        done = terminated | truncated
-        if done.any():
-            obs[diverged] = self._obs[diverged]
-        if done.any() and self.autoreset:
+            com[diverged], obs[diverged] = com_before[diverged], self._obs[diverged]
+        any_ended = _truncate(self._clock, self.horizon, terminated, diverged, truncated)
+        info |= {"diverged": diverged, "com": com}
+        if any_ended and self.autoreset:
+            done = terminated | truncated
             info |= {
                 "final_obs": obs.copy(),
                 "_final_obs": done,
@@ -197,10 +265,10 @@ class RobotTaskEnv(gym.vector.VectorEnv):
 
     def _observe(self) -> np.ndarray:
         """(N, D) float32 observation of the current state, within its bounds."""
-        sources = {"qpos": self.physics.qpos, "qvel": self.physics.qvel, "com": self.physics.com}
-        parts = [sources[q.source][:, q.index[0] : q.index[-1] + 1] for q in self.quantities]
-        obs = np.concatenate([*parts, self.task.observe()], 1).astype(np.float32)
-        return np.clip(obs, self._low, self._high, out=obs)
+        physics, obs = self.physics, np.empty(self._obs.shape, np.float32)
+        columns, bounds = (self._source, self._column), (self._low, self._high)
+        _fill(physics.qpos, physics.qvel, physics.com, self.task.observe(), *columns, *bounds, obs)
+        return obs
 
     def get_state(self) -> dict[str, Any]:
         """Everything a bit-identical continuation needs, as arrays and integers."""
