@@ -120,9 +120,11 @@ def collect(
     for t in range(T):
         is_decision[t] = steps_left == 0
         where = np.flatnonzero(is_decision[t])
-        if len(where):
+        if len(where) == N:  # at every step without action repeat
+            action = act(obs, noise[t])
+        elif len(where):
             action[where] = act(obs[where], noise[t][where])
-            steps_left[where] = config.action_repeat
+        steps_left[where] = config.action_repeat
         obs, done = steps.step(t, action)
         steps_left -= 1
         steps_left[done] = 0

@@ -98,7 +98,7 @@ def flat_copy(policy, hidden):
     flat = GaussianPolicy(2, 2, hidden, torch.Generator().manual_seed(9))
     weight, bias = policy.skills.first.effective()
     with torch.no_grad():
-        flat.mean[0].weight.copy_(weight[0].T)
+        flat.mean[0].weight.copy_(weight[0])
         flat.mean[0].bias.copy_(bias[0])
         for i in (2, 4):
             flat.mean[i].weight.copy_(policy.skills.rest[i - 2].weight)

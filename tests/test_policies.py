@@ -9,12 +9,10 @@ import torch
 from hippo.core.policies import (
     GaussianPolicy,
     Manager,
-    SkillLinear,
     SkillPolicy,
-    Tanh,
-    affine,
     gaussian_entropy,
     gaussian_log_prob,
+    grouped_gaussian_log_prob,
     sample_categorical,
 )
 
@@ -34,31 +32,18 @@ def test_gaussian_log_prob_and_entropy_are_those_of_the_distribution():
     assert float(gaussian_log_prob(zero, zero, zero)) == pytest.approx(-math.log(2 * math.pi), abs=1e-12)
 
 
-def test_our_tanh_and_its_gradient_are_torchs():
-    x = torch.linspace(-6, 6, 101, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(Tanh(), (x,))
-    torch.testing.assert_close(Tanh()(x), torch.tanh(x), rtol=0, atol=1e-15)
-
-
-@pytest.mark.parametrize("integration", ["bilinear", "concatenate"])
-def test_the_skill_layer_is_a_linear_layer_over_the_one_hot_input(integration):
-    layer = SkillLinear(3, 4, 5, integration, generator()).double()
-    x = torch.randn(7, 3, generator=generator(1), dtype=torch.float64)
-    skill = torch.tensor([0, 0, 1, 2, 2, 2, 3])
-    z = torch.nn.functional.one_hot(skill, 4).double()
-    product = (x.unsqueeze(2) * z.unsqueeze(1)).flatten(1)  # entry i Z + j is x_i z_j
-    inputs = torch.cat([x, z, product] if integration == "bilinear" else [x, z], 1)
-    expected = inputs @ layer.weight.T + layer.bias
-    torch.testing.assert_close(layer.grouped(x, [2, 1, 3, 1]), expected)
-    torch.testing.assert_close(layer.all_skills(x)[torch.arange(7), skill], expected)
-    if integration == "bilinear":
-        wrong = torch.cat([x, z, (z.unsqueeze(2) * x.unsqueeze(1)).flatten(1)], 1)  # skill-major flattening
-        assert not torch.allclose(wrong @ layer.weight.T + layer.bias, expected)
-
-
-def test_an_unknown_integration_is_named():
-    with pytest.raises(ValueError, match="integration=sum"):
-        SkillLinear(3, 4, 5, "sum", generator())
+@pytest.mark.parametrize("counts", [[9], [2, 0, 4, 3]])
+def test_the_grouped_log_probability_and_its_gradients_are_those_of_the_plain_formula(counts):
+    mean, action = torch.randn(2, 9, 3, generator=generator(), dtype=torch.float64)
+    log_std = torch.randn(len(counts), 3, generator=generator(1), dtype=torch.float64, requires_grad=True)
+    gradient = torch.randn(9, generator=generator(2), dtype=torch.float64)
+    mean.requires_grad_()
+    group = torch.arange(len(counts)).repeat_interleave(torch.tensor(counts))
+    ours = grouped_gaussian_log_prob(mean, log_std, action, counts)
+    plain = gaussian_log_prob(mean, log_std[group], action)
+    torch.testing.assert_close(ours, plain)
+    for mine, theirs in zip(*(torch.autograd.grad(y, (mean, log_std), gradient) for y in (ours, plain)), strict=True):
+        torch.testing.assert_close(mine, theirs)
 
 
 @pytest.mark.parametrize("per_skill", [False, True])
@@ -124,21 +109,3 @@ def test_the_numpy_twins_of_manager_and_flat_policy_compute_what_torch_does():
         flat.log_std_parameter.fill_(1.0)
     moved = flat.actor()(obs.numpy(), np.ones((7, 2), np.float32)) - action
     np.testing.assert_allclose(moved, np.full((7, 2), np.e), rtol=1e-5)
-
-
-@pytest.mark.parametrize("rows", [1, 3, 4, 50, 1000])
-@pytest.mark.parametrize(("inputs", "outputs"), [(17, 32), (64, 64), (64, 6), (256, 64), (17, 256)])
-def test_affine_and_its_gradients_are_those_of_float64(rows, inputs, outputs):
-    """Also of a transposed weight and of a strided bias, which oneDNN alone misreads."""
-    x = torch.randn(rows, inputs, generator=generator(), requires_grad=True)
-    weight = torch.randn(inputs, outputs, 3, generator=generator(1), requires_grad=True)
-    bias = torch.randn(outputs, 3, generator=generator(2), requires_grad=True)
-    gradient = torch.randn(rows, outputs, generator=generator(3))
-    y = affine(x, weight[..., 1].T, bias[:, 1])
-    y.backward(gradient)
-    exact = [t.detach().double().requires_grad_() for t in (x, weight, bias)]
-    reference = exact[0] @ exact[1][..., 1] + exact[2][:, 1]
-    reference.backward(gradient.double())
-    torch.testing.assert_close(y.double(), reference, rtol=1e-4, atol=1e-4)
-    for ours, theirs in zip((x, weight, bias), exact, strict=True):
-        torch.testing.assert_close(ours.grad.double(), theirs.grad, rtol=1e-4, atol=5e-4)

@@ -168,7 +168,7 @@ def test_with_one_skill_and_the_same_batch_hippos_skill_objective_is_flat_ppos()
     flat = GaussianPolicy(2, 2, [16, 16], torch.Generator().manual_seed(1))
     weight, bias = policy.skills.first.effective()
     with torch.no_grad():
-        flat.mean[0].weight.copy_(weight[0].T)
+        flat.mean[0].weight.copy_(weight[0])
         flat.mean[0].bias.copy_(bias[0])
         for mine, theirs in zip((flat.mean[2], flat.mean[4]), policy.skills.rest[::2], strict=True):
             mine.weight.copy_(theirs.weight)

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import gymnasium as gym
+import numba
 import numpy as np
 import torch
 from torch import Tensor, nn
@@ -169,10 +170,12 @@ class Commitment:
     """Which skill every environment is committed to, and for how many more steps (Algorithm 1, lines 4 to 10)."""
 
     def __init__(self, policy: HierarchicalPolicy, num_envs: int, period_max: int) -> None:
-        self.sees_time, self.period_max = policy.sees_time, period_max
+        self.sees_time = policy.sees_time
         self.logits = policy.manager.actor()
         self.skill = np.zeros(num_envs, np.int64)  # (N,)
         self.steps_left = np.zeros(num_envs, np.int64)  # (N,)
+        self.time_left = np.zeros(num_envs, np.float32)  # (N,) steps left over the longest period, in (0, 1]
+        self._fraction = (np.arange(period_max + 1) / period_max).astype(np.float32)  # steps left -> time left
 
     def renew(self, obs: np.ndarray, period: np.ndarray, uniform: np.ndarray | None) -> np.ndarray:
         """Where a commitment has run out take the new `period` (N,), then let the manager choose.
@@ -183,24 +186,52 @@ class Commitment:
         Returns:
             (N,) bool, where a decision was made.
         """
-        is_decision = self.steps_left == 0
+        is_decision = np.empty(len(obs), bool)
+        _renew_periods(self.steps_left, period, self._fraction, self.time_left, is_decision)
         where = np.flatnonzero(is_decision)
         if len(where):
-            self.steps_left[where] = period[where]
-            seen = np.concatenate([obs, self.time_left[:, None]], 1)[where] if self.sees_time else obs[where]
-            logits = self.logits(seen)
+            logits = self.logits(look(obs, self.time_left, where, obs.shape[1], self.sees_time))
             self.skill[where] = logits.argmax(-1) if uniform is None else sample_categorical(logits, uniform[where])
         return is_decision
 
-    @property
-    def time_left(self) -> np.ndarray:
-        """(N,) steps left over the longest period, in (0, 1]."""
-        return (self.steps_left / self.period_max).astype(np.float32)
-
     def advance(self, done: np.ndarray) -> None:
         """One environment step has passed; an episode's end cuts the commitment."""
-        self.steps_left -= 1
-        self.steps_left[done] = 0
+        _advance(self.steps_left, done)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _renew_periods(
+    steps_left: np.ndarray, period: np.ndarray, fraction: np.ndarray, time_left: np.ndarray, is_decision: np.ndarray
+) -> None:
+    """Start the new period where no steps are left, and write where that is and fraction[steps_left]; all (N,)."""
+    for i in range(len(steps_left)):
+        is_decision[i] = steps_left[i] == 0
+        if is_decision[i]:
+            steps_left[i] = period[i]
+        time_left[i] = fraction[steps_left[i]]
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _advance(steps_left: np.ndarray, done: np.ndarray) -> None:
+    for i in range(len(steps_left)):
+        steps_left[i] = 0 if done[i] else steps_left[i] - 1
+
+
+def look(obs: np.ndarray, time_left: np.ndarray, where: np.ndarray, view: int, sees_time: bool) -> np.ndarray:
+    """What a level sees in the rows `where` (K,): the first `view` entries of obs (N, D) and perhaps the time left."""
+    seen = np.empty((len(where), view + sees_time), np.float32)
+    _look(obs, time_left, where, view, seen)
+    return seen
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _look(obs: np.ndarray, time_left: np.ndarray, where: np.ndarray, view: int, seen: np.ndarray) -> None:
+    """Write `look` to seen (K, view [+ 1])."""
+    for k in range(len(where)):
+        for d in range(view):
+            seen[k, d] = obs[where[k], d]
+        if seen.shape[1] > view:
+            seen[k, view] = time_left[where[k]]
 
 
 @dataclass
@@ -240,14 +271,14 @@ def collect(
     time_left = np.empty((T + 1, N), np.float32)
     is_decision = np.empty((T + 1, N), bool)
 
-    act, view = policy.skills.actor(), policy.skill_view
+    act, everywhere = policy.skills.actor(), np.arange(N)
     commitment = Commitment(policy, N, config.period_max)
     obs = steps.reset(seeding.integer(seed, "episodes", iteration))
     for t in range(T + 1):
         is_decision[t] = commitment.renew(obs, period[t], None if greedy else uniform[t])
         skill[t], time_left[t] = commitment.skill, commitment.time_left
         if t < T:
-            seen = np.concatenate([obs[:, :view], time_left[t, :, None]], 1) if policy.sees_time else obs[:, :view]
+            seen = look(obs, commitment.time_left, everywhere, policy.skill_view, policy.sees_time)
             obs, done = steps.step(t, act(seen, skill[t], noise[t]))
             commitment.advance(done)
 

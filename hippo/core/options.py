@@ -11,7 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from hippo.core.policies import Manager, SkillPolicy, for_few_rows, mlp, sample_categorical
+from hippo.core.networks import for_few_rows, mlp
+from hippo.core.policies import Manager, SkillPolicy, sample_categorical
 from hippo.core.rollout import Steps
 
 FILTER_RANGE = 5.0  # filtered observations are clipped to +- this (OpenAI baselines)

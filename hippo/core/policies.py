@@ -1,104 +1,20 @@
 """Policies: a flat Gaussian, the manager's categorical and the skill network (paper section 2 and appendix A).
 
-All nets are tanh multilayer perceptrons with Glorot-uniform weights and zero biases, as in the authors' code. Standard
-deviations do not depend on the state.
+All nets are tanh multilayer perceptrons (networks.py). Standard deviations do not depend on the state.
 """
 
-import itertools
 import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import numba
 import numpy as np
 import torch
 from torch import Tensor, nn
 
+from hippo.core.networks import SkillLinear, Tanh, for_few_grouped_rows, for_few_rows, grouped_layers, mlp
+
 MIN_STD = 1e-4  # floor of the standard deviation (authors' code)
-SAME_BITS_TERMS = 192  # MKL adds up as many terms before it starts a new partial sum
-
-
-class _Tanh(torch.autograd.Function):
-    """tanh by numpy's vectorised routine: on a CPU ten times faster than torch's, and a third of an update's time."""
-
-    @staticmethod
-    def forward(ctx: Any, x: Tensor) -> Tensor:
-        y = torch.from_numpy(np.tanh(x.detach().numpy()))
-        ctx.save_for_backward(y)
-        return y
-
-    @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> Tensor:
-        (y,), (gradient,) = ctx.saved_tensors, gradients
-        return torch.addcmul(gradient, gradient * y, y, value=-1)  # (1 - tanh^2) of the gradient
-
-
-class Tanh(nn.Module):
-    """The hidden activation of all policies."""
-
-    def forward(self, x: Tensor) -> Tensor:
-        """Elementwise tanh."""
-        return _Tanh.apply(x)
-
-
-class _Affine(torch.autograd.Function):
-    """x W^T + b by oneDNN. The weight's gradient sums over rows and is left to torch's default, MKL."""
-
-    @staticmethod
-    def forward(ctx: Any, x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-        ctx.save_for_backward(x, weight)
-        return _product(x, weight, bias)
-
-    @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, Tensor, Tensor]:
-        (x, weight), (gradient,) = ctx.saved_tensors, gradients
-        to_x = None
-        if ctx.needs_input_grad[0]:
-            to_x = _product(gradient, weight.T) if len(weight) <= SAME_BITS_TERMS else gradient @ weight
-        return to_x, gradient.T @ x, gradient.sum(0)
-
-
-def _product(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
-    # oneDNN misreads a strided bias and crawls through other strides.
-    bias = None if bias is None else bias.contiguous()
-    return torch.ops.mkldnn._linear_pointwise(x.contiguous(), weight.contiguous(), bias, "none", [], "")
-
-
-def affine(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-    """x W^T + b: (B, D), (H, D), (H,) -> (B, H), as `torch.nn.functional.linear` in half its time on AMD's CPUs.
-
-    MKL does not use AVX-512 there and oneDNN does. It is used where both give the same bits (measured on an AMD EPYC,
-    family 26): sums of at most 192 terms, at least 4 rows and 16 outputs.
-    """
-    outputs, inputs = weight.shape
-    same_bits = len(x) >= 4 and outputs >= 16 and inputs <= SAME_BITS_TERMS
-    if same_bits and x.dtype == torch.float32 and torch.backends.mkldnn.is_available():
-        return _Affine.apply(x, weight, bias)
-    return torch.addmm(bias, x, weight.T)
-
-
-class Linear(nn.Linear):
-    """A linear layer computed by `affine`."""
-
-    def forward(self, x: Tensor) -> Tensor:
-        """(B, D) -> (B, H)."""
-        return affine(x, self.weight, self.bias) if x.ndim == 2 else super().forward(x)
-
-
-def linear(inputs: int, outputs: int, generator: torch.Generator) -> nn.Linear:
-    """A linear layer with Glorot-uniform weights and zero bias."""
-    layer = Linear(inputs, outputs)
-    with torch.no_grad():
-        nn.init.xavier_uniform_(layer.weight, generator=generator)
-        layer.bias.zero_()
-    return layer
-
-
-def mlp(sizes: Sequence[int], generator: torch.Generator, activation: type[nn.Module] = Tanh) -> nn.Sequential:
-    """Layers sizes[0] -> ... -> sizes[-1] with `activation` between them and none after the last."""
-    layers: list[nn.Module] = []
-    for inputs, outputs in itertools.pairwise(sizes):
-        layers += [linear(inputs, outputs, generator), activation()]
-    return nn.Sequential(*layers[:-1])
 
 
 def gaussian_log_prob(mean: Tensor, log_std: Tensor, action: Tensor) -> Tensor:
@@ -108,6 +24,81 @@ def gaussian_log_prob(mean: Tensor, log_std: Tensor, action: Tensor) -> Tensor:
     return -0.5 * residual.square().sum(-1) - log_std.sum(-1) - constant
 
 
+class _GroupedGaussian(torch.autograd.Function):
+    """`grouped_gaussian_log_prob` and its gradient in closed form, one pass over the rows each way."""
+
+    @staticmethod
+    def forward(ctx: Any, mean: Tensor, log_std: Tensor, action: Tensor, counts: Sequence[int]) -> Tensor:
+        mean, log_std, action, out = (
+            mean.contiguous(),
+            log_std.contiguous(),
+            action.contiguous(),
+            mean.new_empty(len(mean)),
+        )
+        _log_densities(mean.numpy(), log_std.numpy(), action.numpy(), np.array(counts), out.numpy())
+        ctx.save_for_backward(mean, log_std, action)
+        ctx.counts = np.array(counts)
+        return out
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor, None, None]:
+        mean, log_std, action = (t.numpy() for t in ctx.saved_tensors)
+        to_mean, to_log_std = np.empty_like(mean), np.zeros(log_std.shape)
+        gradient = gradients[0].contiguous().numpy()
+        _through_log_densities(gradient, mean, log_std, action, ctx.counts, to_mean, to_log_std)
+        return torch.from_numpy(to_mean), torch.from_numpy(to_log_std.astype(log_std.dtype)), None, None
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _log_densities(
+    mean: np.ndarray, log_std: np.ndarray, action: np.ndarray, counts: np.ndarray, out: np.ndarray
+) -> None:
+    """Write log N(action; mean, std) to out (B,): mean and action (B, A), log_std (Z, A), counts (Z,)."""
+    row, A = 0, mean.shape[1]
+    for z in range(len(counts)):
+        constant = 0.5 * A * np.log(2 * np.pi) + log_std[z].sum()
+        precision = np.exp(-2.0 * log_std[z])
+        for i in range(row, row + counts[z]):
+            square = 0.0
+            for j in range(A):
+                square += (action[i, j] - mean[i, j]) ** 2 * precision[j]
+            out[i] = -0.5 * square - constant
+        row += counts[z]
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _through_log_densities(
+    gradient: np.ndarray,
+    mean: np.ndarray,
+    log_std: np.ndarray,
+    action: np.ndarray,
+    counts: np.ndarray,
+    to_mean: np.ndarray,
+    to_log_std: np.ndarray,
+) -> None:
+    """Write the gradient (B,) with respect to mean (B, A), and add that of log_std to zeros (Z, A) in float64.
+
+    d log N / d mean = (a - mean) / std^2 and d log N / d log std = (a - mean)^2 / std^2 - 1.
+    """
+    row = 0
+    for z in range(len(counts)):
+        precision = np.exp(-2.0 * log_std[z])
+        for i in range(row, row + counts[z]):
+            for j in range(mean.shape[1]):
+                residual = action[i, j] - mean[i, j]
+                to_mean[i, j] = gradient[i] * residual * precision[j]
+                to_log_std[z, j] += gradient[i] * (residual * residual * precision[j] - 1.0)
+        row += counts[z]
+
+
+def grouped_gaussian_log_prob(mean: Tensor, log_std: Tensor, action: Tensor, counts: Sequence[int]) -> Tensor:
+    """`gaussian_log_prob` of rows in Z groups with a log_std each: (B, A), (Z, A), (B, A), Z counts -> (B,).
+
+    The same number in a tenth of the time; `action` gets no gradient.
+    """
+    return _GroupedGaussian.apply(mean, log_std, action, counts)
+
+
 def gaussian_entropy(log_std: Tensor) -> Tensor:
     """Differential entropy of a diagonal Gaussian: (..., A) -> (...)."""
     return log_std.sum(-1) + 0.5 * log_std.shape[-1] * (1 + math.log(2 * math.pi))
@@ -115,24 +106,21 @@ def gaussian_entropy(log_std: Tensor) -> Tensor:
 
 def sample_categorical(logits: np.ndarray, uniform: np.ndarray) -> np.ndarray:
     """Inverse-CDF sample: logits (K, Z) and uniform (K,) in [0, 1) -> indices (K,)."""
-    cumulative = np.cumsum(np.exp(logits - logits.max(-1, keepdims=True)), -1)
-    return (uniform[:, None] * cumulative[:, -1:] >= cumulative).sum(-1).clip(max=logits.shape[-1] - 1)
+    out = np.empty(len(logits), np.int64)
+    _sample_categorical(logits, uniform, out)
+    return out
 
 
-def for_few_rows(net: nn.Sequential) -> Callable[[np.ndarray], np.ndarray]:
-    """The function that an `mlp` with tanh computes now, in numpy, whose calls cost a third of torch's.
-
-    It shares memory with the parameters' current values and must not outlive them.
-    """
-    layers = [(m.weight.detach().numpy().T, m.bias.detach().numpy()) for m in net if isinstance(m, nn.Linear)]
-
-    def forward(x: np.ndarray) -> np.ndarray:
-        for i, (weight, bias) in enumerate(layers):
-            x = np.matmul(np.tanh(x, out=x) if i else x, weight)
-            x += bias
-        return x
-
-    return forward
+@numba.njit(cache=True, error_model="numpy")
+def _sample_categorical(logits: np.ndarray, uniform: np.ndarray, out: np.ndarray) -> None:
+    """Write `sample_categorical` to out (K,)."""
+    for i in range(len(logits)):
+        weight = np.exp(logits[i] - logits[i].max())
+        left = uniform[i] * weight.sum()
+        out[i] = 0
+        while out[i] < len(weight) - 1 and left >= weight[out[i]]:
+            left -= weight[out[i]]
+            out[i] += 1
 
 
 class GaussianPolicy(nn.Module):
@@ -152,7 +140,7 @@ class GaussianPolicy(nn.Module):
 
     def log_prob(self, obs: Tensor, action: Tensor) -> Tensor:
         """log pi(a|s): (B, D), (B, A) -> (B,)."""
-        return gaussian_log_prob(self.mean(obs), self.log_std, action)
+        return grouped_gaussian_log_prob(self.mean(obs), self.log_std.unsqueeze(0), action, [len(obs)])
 
     def actor(self) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
         """A function from obs (N, D) and standard normal noise (N, A) to actions (N, A), for the current parameters."""
@@ -176,45 +164,6 @@ class Manager(nn.Module):
         return self.logits(obs).log_softmax(-1)
 
 
-class SkillLinear(nn.Module):
-    """First layer over an input x and a one-hot skill z, either [x, z, x (x) z] ("bilinear") or [x, z] ("concatenate").
-
-    The product is flattened with x major (entry i Z + j is x_i z_j), as in the authors' network. As z is one-hot the
-    layer is an ordinary linear layer whose weight depends on the skill, and that is how it is computed.
-    """
-
-    def __init__(
-        self, inputs: int, num_skills: int, outputs: int, integration: str, generator: torch.Generator
-    ) -> None:
-        super().__init__()
-        if integration not in ("bilinear", "concatenate"):
-            raise ValueError(f"integration={integration}: must be one of bilinear, concatenate")
-        self.inputs, self.num_skills, self.integration = inputs, num_skills, integration
-        width = inputs + num_skills + (inputs * num_skills if integration == "bilinear" else 0)
-        layer = linear(width, outputs, generator)
-        self.weight, self.bias = layer.weight, layer.bias  # (H, width), (H,)
-
-    def effective(self) -> tuple[Tensor, Tensor]:
-        """The weight (Z, D, H) and the bias (Z, H) that the one-hot input leaves for each skill."""
-        D, Z = self.inputs, self.num_skills
-        weight = self.weight[:, :D].T.unsqueeze(0)  # (1, D, H)
-        if self.integration == "bilinear":
-            weight = weight + self.weight[:, D + Z :].view(-1, D, Z).permute(2, 1, 0)
-        return weight.expand(Z, -1, -1), self.bias + self.weight[:, D : D + Z].T
-
-    def all_skills(self, x: Tensor) -> Tensor:
-        """The layer under every skill: (B, D) -> (B, Z, H)."""
-        weight, bias = self.effective()
-        flat = x @ weight.permute(1, 0, 2).reshape(self.inputs, -1)
-        return flat.view(len(x), self.num_skills, -1) + bias
-
-    def grouped(self, x: Tensor, counts: Sequence[int]) -> Tensor:
-        """Rows sorted by skill, `counts[z]` of each: (B, D) -> (B, H). One matrix product per skill."""
-        weight, bias = self.effective()
-        parts = x.split(list(counts))
-        return torch.cat([affine(part, weight[z].T, bias[z]) for z, part in enumerate(parts)])
-
-
 class SkillPolicy(nn.Module):
     """The lower level pi_l(a|s, z): one network for all skills (paper section 4.1).
 
@@ -235,7 +184,6 @@ class SkillPolicy(nn.Module):
         super().__init__()
         self.num_skills = num_skills
         self.first = SkillLinear(obs_size, num_skills, hidden_sizes[0], integration, generator)
-        self.after_first = Tanh()
         self.rest = mlp([*hidden_sizes, action_size], generator)
         rows = num_skills if log_std_per_skill else 1
         self.log_std_parameter = nn.Parameter(torch.zeros(rows, action_size))
@@ -247,24 +195,23 @@ class SkillPolicy(nn.Module):
     def actor(self) -> Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]:
         """A function from obs (N, D), skill (N,) and standard normal noise (N, A) to actions (N, A).
 
-        For the current parameters. The first layer is computed for every skill, as one product, and then selected.
+        For the current parameters.
         """
-        weight, bias = (x.detach().numpy() for x in self.first.effective())  # (Z, D, H), (Z, H)
-        flat = np.ascontiguousarray(weight.transpose(1, 0, 2).reshape(self.first.inputs, -1))
-        rest, std = for_few_rows(self.rest), self.log_std().exp().detach().numpy()
+        mean = for_few_grouped_rows(*self.first.effective(), self.rest.layers)
+        std = self.log_std()[: len(self.log_std_parameter)].exp().detach().numpy()  # (1 or Z, A)
 
         def act(obs: np.ndarray, skill: np.ndarray, noise: np.ndarray) -> np.ndarray:
-            hidden = np.matmul(obs, flat).reshape(len(obs), len(bias), -1)[np.arange(len(obs)), skill]
-            hidden += bias[skill]
-            return rest(np.tanh(hidden, out=hidden)) + std[skill] * noise
+            action = mean(obs, skill)
+            action += (std if len(std) == 1 else std[skill]) * noise
+            return action
 
         return act
 
     def log_prob(self, obs: Tensor, skill: Tensor, action: Tensor) -> Tensor:
         """log pi_l(a|s, z) of rows *sorted by skill*: (B, D), (B,), (B, A) -> (B,)."""
         counts = torch.bincount(skill, minlength=self.num_skills).tolist()
-        mean = self.rest(self.after_first(self.first.grouped(obs, counts)))
-        return gaussian_log_prob(mean, self.log_std()[skill], action)
+        mean = grouped_layers(obs, counts, *self.first.effective(), self.rest.layers, Tanh)
+        return grouped_gaussian_log_prob(mean, self.log_std(), action, counts)
 
     def log_prob_all(self, obs: Tensor, action: Tensor) -> Tensor:
         """log pi_l(a|s, z) under every skill: (B, D), (B, A) -> (B, Z)."""
@@ -272,4 +219,6 @@ class SkillPolicy(nn.Module):
 
     def means(self, obs: Tensor) -> Tensor:
         """Mean action of every skill: (B, D) -> (B, Z, A)."""
-        return self.rest(self.after_first(self.first.all_skills(obs)))
+        rows, counts = obs.repeat(self.num_skills, 1), [len(obs)] * self.num_skills
+        mean = grouped_layers(rows, counts, *self.first.effective(), self.rest.layers, Tanh)
+        return mean.view(self.num_skills, len(obs), -1).transpose(0, 1)

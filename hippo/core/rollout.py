@@ -9,6 +9,7 @@ import time
 from typing import Any
 
 import gymnasium as gym
+import numba
 import numpy as np
 import torch
 from torch import Tensor
@@ -27,6 +28,33 @@ class LastInfo(gym.vector.VectorWrapper):
         result = self.env.step(actions)
         self.info = result[-1]
         return result
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _record(
+    t: int,
+    action: np.ndarray,
+    obs: np.ndarray,
+    reward: np.ndarray,
+    terminated: np.ndarray,
+    truncated: np.ndarray,
+    actions: np.ndarray,
+    observations: np.ndarray,
+    rewards: np.ndarray,
+    ends: np.ndarray,
+    done: np.ndarray,
+) -> bool:
+    """Write step t, what followed it and whether an episode ended, in ends and done; return if any did."""
+    ended = False
+    for i in range(len(reward)):
+        for j in range(action.shape[1]):
+            actions[t, i, j] = action[i, j]
+        for j in range(obs.shape[1]):
+            observations[t + 1, i, j] = obs[i, j]
+        rewards[t, i] = reward[i]
+        ends[t, i] = done[t, i] = terminated[i] or truncated[i]
+        ended |= done[t, i]
+    return ended
 
 
 class Steps:
@@ -62,20 +90,21 @@ class Steps:
         obs, reward, terminated, truncated, info = self.envs.step(action)
         self.physics_seconds += time.perf_counter() - start
         write = self._write
-        write["action"][t], write["obs"][t + 1], write["reward"][t] = action, obs, reward
-        done = terminated | truncated
-        if done.any():
+        done = write["done"][t]
+        ended = _record(
+            t,
+            *(action, obs, reward, terminated, truncated),
+            *(write["action"], write["obs"], write["reward"], write["terminated"], write["done"]),
+        )
+        if ended:
             self.diverged += int(info["diverged"].sum())
             if self.bootstrap_horizon:
                 bootstrapped = truncated & ~info["diverged"]
                 where = np.flatnonzero(bootstrapped)
                 self._final.append((t, where, info["final_obs"][where]))
-                terminated = done & ~bootstrapped
-            else:
-                terminated = done
+                write["terminated"][t, where] = False
         if "velocity_penalty" in info:
             self.penalty += float(info["velocity_penalty"].sum())
-        write["terminated"][t], write["done"][t] = terminated, done
         return obs, done
 
     @property

@@ -33,7 +33,7 @@ class SkillsError(ValueError):
 
 def network_of(policy: SkillPolicy) -> dict[str, Any]:
     """What has to agree between two skill networks for one to hold the other's weights."""
-    linear = list(policy.rest.children())[::2]  # an activation after each but the last
+    linear = policy.rest.layers
     return {
         "num_skills": policy.num_skills,
         "hidden_sizes": [layer.in_features for layer in linear],
