@@ -78,8 +78,11 @@ test-report: install  ## the report in a real browser, Debian's Chromium, instal
 
 smoke: fig3  ## train and draw Figure 3 at smoke scale
 
-bench: install  ## steps per second as ratios within one run, with a table
-	$(PY) experiments.bench
+bench: install  ## speeds as ratios within one run, 25 minutes; QUICK=1, ONLY="peers memory", WRITE=1 (docs/performance.md)
+	@$(PY) experiments.bench $(if $(QUICK),--quick) $(if $(ONLY),--only $(ONLY)) $(if $(WRITE),--write)
+
+profile: install  ## a flame graph of one HiPPO iteration on Ant Gather, docs/pictures/profile_ant_gather.svg
+	@$(PY) experiments.bench_flame
 
 install-render:  ## what off-screen drawing needs, by apt (as root)
 	apt-get update -qq && apt-get install -y -qq --no-install-recommends libegl1 libgl1-mesa-dri
@@ -97,4 +100,4 @@ help:  ## this list
 	@echo "  make tableN      the same for: $(or $(TABLES),none yet)"
 	@echo "  make plan-figN   what it would train and cost, without training"
 
-.PHONY: install install-render all report skills-gallery claims results lint test test-slow test-slurm test-report smoke bench video clean help $(FIGURES) $(TABLES)
+.PHONY: install install-render all report skills-gallery claims results lint test test-slow test-slurm test-report smoke bench profile video clean help $(FIGURES) $(TABLES)

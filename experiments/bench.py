@@ -1,102 +1,105 @@
-"""How fast are we, as ratios within one run: bare physics, environments, whole training iterations, memory.
+"""How fast are we, as ratios within one run: physics, environments, whole iterations, peers, scaling, memory.
 
-    python -m experiments.bench [--quick]
+    python -m experiments.bench [--quick] [--only PART ...] [--write]
 
-Absolute numbers depend on the machine and on what else it does; ratios within one run hardly do. One thread unless the
-row says otherwise.
+Absolute numbers depend on the machine and on what else it does; ratios of what took turns hardly do. One thread unless
+the row says otherwise.
 """
 
-import argparse
-import statistics
-import subprocess
 import sys
-import tempfile
-from pathlib import Path
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 
 import torch
 
-from experiments import bench_environments, bench_peers, bench_scaling, bench_sweeps
-from experiments.bench_environments import physics_and_environment
-from experiments.config import Run, algorithm, compose_run
-from hippo.core.checkpoint import Checkpoint
-from hippo.core.log import RunLog
-from hippo.envs import make
-from hippo.envs.vector import RobotTaskEnv
+from experiments import (
+    bench_environments,
+    bench_iterations,
+    bench_memory,
+    bench_peers,
+    bench_scaling,
+    bench_sweeps,
+    bench_targets,
+)
+from experiments.bench_measure import Row
+from experiments.command_line import Parser, clock, duration
+from experiments.status import write_atomically
 
-NUM_ENVS = {"ant_gather": 20, "snake_gather": 13, "block_hopper": 50, "block_half_cheetah": 50}  # of the paper's batch
-# (what, environment) -> the least ratio to bare stepping that we aim at
-TARGETS = {
-    ("HiPPO random p", "ant_gather"): 0.65,
-    ("HiPPO random p", "snake_gather"): 0.9,
-    ("HiPPO random p", "block_hopper"): 0.6,
-    ("HiPPO random p", "block_half_cheetah"): 0.65,
+
+@dataclass(frozen=True)
+class Part:
+    """One part: `rows(quick)` measures and yields lines as they come."""
+
+    rows: Callable[[bool], Iterator[Row | str]]
+    seconds: float  # it takes about this on two busy cores
+    quick_seconds: float
+
+
+PARTS = {
+    "iterations": Part(bench_iterations.rows, 480, 60),
+    "environments": Part(bench_environments.rows, 80, 20),
+    "peers": Part(bench_peers.rows, 150, 20),
+    "scaling": Part(bench_scaling.rows, 220, 60),
+    "memory": Part(bench_memory.rows, 140, 30),
+    "workers": Part(bench_sweeps.rows, 140, 30),
+    "fig3": Part(bench_sweeps.front_door, 220, 0),
 }
 
 
-def training(run: Run, iterations: int) -> float:
-    """Environment steps per second of whole iterations, collection and update, after a first one."""
-    speeds: list[float] = []
-
-    def make_envs(num_envs: int, purpose: str) -> RobotTaskEnv:
-        return make(run.env, num_envs, 0, horizon=run.config.horizon, **run.options)
-
-    with tempfile.TemporaryDirectory() as folder:
-        log = RunLog(Path(folder), lambda _, timing: speeds.append(float(timing["steps_per_second"])))
-        algorithm(run.algo).train(run.config, make_envs, log, 0, Checkpoint(Path(folder)))
-    return statistics.median(speeds[1:]) if iterations > 1 else speeds[0]
-
-
-def peak_memory(overrides: list[str]) -> float:
-    """Peak resident memory in MB of a fresh process that trains one iteration."""
-    code = (
-        "import sys, tempfile; from experiments.train import main; from experiments.bench import own_peak; "
-        "main([*sys.argv[1:], 'runs_dir=' + tempfile.mkdtemp()]); print(own_peak())"
-    )
-    command = [sys.executable, "-c", code, *overrides]
-    return float(subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()[-1])
+def measure(names: list[str], quick: bool, show: Callable[[str], None]) -> dict[str, float]:
+    """Do the parts and `show` the lines of their table; what was measured of the targets by key."""
+    expected = {name: PARTS[name].quick_seconds if quick else PARTS[name].seconds for name in names}
+    print(f"{len(names)} parts, about {duration(sum(expected.values()))} on two busy cores: {', '.join(names)}")
+    measured, start, done = {}, time.perf_counter(), 0.0
+    for number, name in enumerate(names, 1):
+        elapsed, left = time.perf_counter() - start, sum(expected.values()) - done
+        eta = left * (elapsed / done if done else 1.0)
+        print(
+            f"\npart {number} of {len(names)}: {name}   elapsed {clock(elapsed)}, left about {clock(eta)}", flush=True
+        )
+        show("")
+        for row in PARTS[name].rows(quick):
+            show(str(row))
+            if isinstance(row, Row) and row.key:
+                measured[row.key] = row.value
+        done += expected[name]
+    print(f"\ndone after {clock(time.perf_counter() - start)}")
+    return measured
 
 
-def own_peak() -> float:
-    """This process's peak resident memory in MB; getrusage's would include that of the process that started it."""
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return next(float(line.split()[1]) / 1024 for line in lines if line.startswith("VmHWM"))
-
-
-def line(what: str, name: str, speed: float, bare: float) -> str:
-    """One row of the table."""
-    target = TARGETS.get((what, name))
-    aim = "" if target is None else f">= {target}" + ("" if speed / bare >= target else "  MISSED")
-    return f"{name:20} {what:22} {speed:12,.0f} {speed / bare:8.2f}   {aim}"
-
-
-def main() -> int:
-    """Print the table."""
-    parser = argparse.ArgumentParser(prog="experiments.bench", description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="a few seconds per row and no memory")
-    options = parser.parse_args()
+def main(arguments: list[str] | None = None) -> int:
+    """Print the table, and put it into docs/performance.md if asked to."""
+    parser = Parser(prog="experiments.bench", description=__doc__.splitlines()[0])
+    parser.add_argument("--quick", action="store_true", help="few and short measurements, to see that all works")
+    parser.add_argument("--only", nargs="+", choices=PARTS, metavar="PART", help=f"some of: {', '.join(PARTS)}")
+    parser.add_argument("--write", action="store_true", help=f"put the table into docs/{bench_targets.PAGE.name}")
+    options = parser.parse_args(arguments)
+    if options.write and (options.quick or options.only):
+        parser.error("--write: needs the whole benchmark, without --quick and --only")
+    if options.write:
+        bench_targets.with_block(bench_targets.PAGE.read_text(), "", [])  # refuses a page without marks now, not later
     torch.set_num_threads(1)
-    seconds, iterations = (0.2, 2) if options.quick else (1.0, 4)
-    print(f"{'environment':20} {'what':22} {'steps/s':>12} {'of bare':>8}   target", flush=True)
-    for name in NUM_ENVS:
-        bare, environment = physics_and_environment(name, NUM_ENVS[name], seconds)
-        print(line("bare Batch.step", name, bare, bare))
-        print(line("environment", name, environment, bare), flush=True)
-        for algo, what in (("hippo", "HiPPO random p"), ("ppo", "PPO")):
-            run = compose_run([f"env={name}", f"algo={algo}", "scale=paper", f"iterations={iterations}"])
-            before, _ = physics_and_environment(name, NUM_ENVS[name], seconds / 2, rounds=3)
-            speed = training(run, iterations)
-            after, _ = physics_and_environment(name, NUM_ENVS[name], seconds / 2, rounds=3)
-            print(line(what, name, speed, (before + after) / 2), flush=True)
-    for part in (bench_environments, bench_scaling, bench_peers):
-        print()
-        for row in part.lines(options.quick):
-            print(row, flush=True)
-    faster, overhead = bench_sweeps.throughput_and_overhead(3 if options.quick else 20)
-    print(f"\ntwo workers: {faster:.2f} times the throughput of one (target >= 1.8, needs two idle cores)")
-    print(f"launcher: {overhead:.2f} s per run beyond training, after a worker's first (target < 0.5)")
-    if not options.quick:
-        memory = peak_memory(["env=ant_gather", "algo=hippo", "scale=paper", "iterations=1"])
-        print(f"peak memory, HiPPO on Ant Gather at the paper's batch: {memory:,.0f} MB (target <= 1,000)")
+    lines: list[str] = []
+
+    def show(line: str) -> None:
+        print(line, flush=True)
+        lines.append(line)
+
+    about = bench_targets.machine()
+    print(about)
+    try:
+        measured = measure(options.only or list(PARTS), options.quick, show)
+    except KeyboardInterrupt:
+        print("\nstopped; nothing was written", file=sys.stderr)
+        return 130
+    show("")
+    for line in bench_targets.closing(measured):
+        show(line)
+    if options.write:
+        page = bench_targets.PAGE
+        write_atomically(page, bench_targets.with_block(page.read_text(), about, lines[1:]))
+        print(f"wrote {page}")
     return 0
 
 

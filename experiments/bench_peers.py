@@ -1,60 +1,34 @@
 """Our flat PPO against Stable-Baselines3 and a CleanRL-style loop, the same work for all three; part of `make bench`.
 
 The same work: environment id, number of environments, steps, networks (policy 256-64, value 32-32, tanh), and ten
-full-batch gradient steps on policy and value per batch; one thread each, peers on our registered environment.
+full-batch gradient steps on policy and value per batch; one thread each, peers on our registered environment. Each
+takes an iteration in turn, with one of ours before and after it.
 """
 
 import functools
-import statistics
-import tempfile
 import time
-from collections.abc import Callable
-from pathlib import Path
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import gymnasium as gym
 import torch
 from torch import nn
 
-from baselines import ppo
-from experiments.config import compose_run
-from hippo.core.checkpoint import Checkpoint
-from hippo.core.log import RunLog
-from hippo.envs import make
+from experiments.bench_iterations import training
+from experiments.bench_measure import Row, beside, contestants, median_ratio, median_reference, median_speed
+from hippo.envs import gymnasium_id
 
-IDS = {"block_hopper": "hippo/BlockHopper-v0", "ant_gather": "hippo/AntGather-v0"}
 NUM_ENVS = {"block_hopper": 50, "ant_gather": 20}
 EPOCHS, CLIP, LEARNING_RATE, GAMMA = 10, 0.1, 3e-3, 0.999
-TARGETS = {"Stable-Baselines3, DummyVecEnv": 4.0, "CleanRL-style, SyncVectorEnv": 3.0}
+Report = Callable[[float], None]
 
 
-def compare(name: str, steps: int, iterations: int) -> dict[str, float]:
-    """Environment steps per second of whole iterations of `steps` steps in every environment, by implementation."""
-    num_envs = NUM_ENVS[name]
-    return {
-        "ours": ours(name, num_envs, steps, iterations),
-        "Stable-Baselines3, DummyVecEnv": stable_baselines(name, num_envs, steps, iterations, processes=False),
-        "Stable-Baselines3, SubprocVecEnv": stable_baselines(name, num_envs, steps, iterations, processes=True),
-        "CleanRL-style, SyncVectorEnv": clean_rl(name, num_envs, steps, iterations),
-    }
-
-
-def ours(name: str, num_envs: int, steps: int, iterations: int) -> float:
-    """Steps per second of baselines/ppo.py."""
-    budget = [f"iterations={iterations + 1}", f"batch_size={num_envs * steps}", f"env.horizon={steps}"]
-    run = compose_run([f"env={name}", "algo=ppo", "scale=paper", *budget])
-    speeds: list[float] = []
-    with tempfile.TemporaryDirectory() as folder:
-        log = RunLog(Path(folder), lambda _, timing: speeds.append(float(timing["steps_per_second"])))
-        ppo.train(run.config, lambda n, purpose: make(name, n, 0, horizon=steps), log, 0, Checkpoint(Path(folder)))
-    return statistics.median(speeds[1:])
-
-
-def stable_baselines(name: str, num_envs: int, steps: int, iterations: int, processes: bool) -> float:
-    """Steps per second of Stable-Baselines3's PPO."""
+def stable_baselines(name: str, num_envs: int, steps: int, processes: bool, report: Report) -> None:
+    """Report steps per second of Stable-Baselines3's PPO."""
     from stable_baselines3 import PPO
     from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
-    one = functools.partial(gym.make, IDS[name])
+    one = functools.partial(_registered, name)
     envs = SubprocVecEnv([one] * num_envs, "fork") if processes else DummyVecEnv([one] * num_envs)
     learner = PPO(
         "MlpPolicy",
@@ -70,24 +44,27 @@ def stable_baselines(name: str, num_envs: int, steps: int, iterations: int, proc
         device="cpu",
         seed=0,
     )
-    speed = timed(lambda: learner.learn(num_envs * steps, reset_num_timesteps=False), num_envs * steps, iterations)
-    envs.close()
-    return speed
+    total = num_envs * steps
+    _report(lambda: learner.learn(total, reset_num_timesteps=False), total, report)
 
 
-def timed(iteration: Callable[[], object], steps: int, iterations: int) -> float:
-    """Median steps per second of calls of `iteration` after a first one."""
-    seconds = []
-    for _ in range(iterations + 1):
+def _registered(name: str) -> Any:
+    import hippo.envs  # noqa: F401  registers the ids
+
+    return gym.make(gymnasium_id(name))
+
+
+def _report(iteration: Callable[[], object], steps: int, report: Report) -> None:
+    """Report steps per second of one call of `iteration` after the other, without end."""
+    while True:
         start = time.perf_counter()
         iteration()
-        seconds.append(time.perf_counter() - start)
-    return steps / statistics.median(seconds[1:])
+        report(steps / (time.perf_counter() - start))
 
 
-def clean_rl(name: str, num_envs: int, steps: int, iterations: int) -> float:
-    """Steps per second of PPO written as one plain loop over Gymnasium's SyncVectorEnv, in CleanRL's manner."""
-    envs = gym.make_vec(IDS[name], num_envs, vectorization_mode=gym.VectorizeMode.SYNC)
+def clean_rl(name: str, num_envs: int, steps: int, report: Report) -> None:
+    """Report steps per second of PPO written as one plain loop over Gymnasium's SyncVectorEnv, in CleanRL's manner."""
+    envs = gym.make_vec(gymnasium_id(name), num_envs, vectorization_mode=gym.VectorizeMode.SYNC)
     obs_size, action_size = envs.single_observation_space.shape[0], envs.single_action_space.shape[0]  # type: ignore[index]
     mean = nn.Sequential(nn.Linear(obs_size, 256), nn.Tanh(), nn.Linear(256, 64), nn.Tanh(), nn.Linear(64, action_size))
     critic = nn.Sequential(nn.Linear(obs_size, 32), nn.Tanh(), nn.Linear(32, 32), nn.Tanh(), nn.Linear(32, 1))
@@ -130,18 +107,27 @@ def clean_rl(name: str, num_envs: int, steps: int, iterations: int) -> float:
             nn.utils.clip_grad_norm_(parameters, 0.5)
             optimizer.step()
 
-    speed = timed(iteration, num_envs * steps, iterations)
-    envs.close()
-    return speed
+    _report(iteration, num_envs * steps, report)
 
 
-def lines(quick: bool) -> list[str]:
-    """The comparison as rows of the benchmark's table."""
-    table = []
-    for name in IDS:
-        speeds = compare(name, 100 if quick else 400, 1 if quick else 3)
-        for what, speed in speeds.items():
-            ratio, target = speeds["ours"] / speed, TARGETS.get(what)
-            aim = "" if target is None else f">= {target}" + ("" if ratio >= target else "  MISSED")
-            table.append(f"{name:20} PPO, {what:32} {speed:12,.0f} {ratio:8.1f}x   {aim}")
-    return table
+def rows(quick: bool) -> Iterator[Row]:
+    """Steps per second of whole iterations, and how many times as fast ours is."""
+    steps, rounds = (100, 1) if quick else (400, 3)
+    for name, num_envs in NUM_ENVS.items():
+        budget = [f"batch_size={num_envs * steps}", f"env.horizon={steps}"]
+        bodies = {
+            "ours": (training, [f"env={name}", "algo=ppo", "scale=paper", *budget]),
+            "Stable-Baselines3, DummyVecEnv": (stable_baselines, name, num_envs, steps, False),
+            "Stable-Baselines3, SubprocVecEnv": (stable_baselines, name, num_envs, steps, True),
+            "CleanRL-style, SyncVectorEnv": (clean_rl, name, num_envs, steps),
+        }
+        with contestants(bodies) as turns:
+            ours = turns.pop("ours")
+            measured = beside(lambda ours=ours: ours().speed, turns, rounds)  # type: ignore[misc]
+        yield Row(name, "PPO, ours", median_reference(measured["CleanRL-style, SyncVectorEnv"]), "steps/s")
+        ratios = {what: 1 / median_ratio(pairs) for what, pairs in measured.items()}
+        faster = min((what for what in ratios if what.startswith("Stable")), key=lambda what: ratios[what])
+        keys = {faster: f"stable_baselines/{name}", "CleanRL-style, SyncVectorEnv": f"clean_rl/{name}"}
+        for what, pairs in measured.items():
+            speed, key = median_speed(pairs), keys.get(what, "")
+            yield Row(name, f"PPO, {what}", speed, "steps/s", ratios[what], "ours over its", key)
