@@ -22,6 +22,7 @@ from experiments.bench_measure import (
     median_ratio,
     median_reference,
     median_speed,
+    one_core,
     rate,
     stepping,
 )
@@ -120,7 +121,7 @@ def rows(quick: bool) -> Iterator[Row | str]:
             budget = (f"env.horizon={config.horizon // 10}", f"batch_size={config.batch_size // 10}")
             overrides, rounds = [*overrides, *budget], 1
         step, _ = stepping(name, config.num_envs)
-        with contestants({algo: (training, [*overrides, f"algo={algo}"]) for algo in LEARNERS}) as turns:
+        with one_core(), contestants({algo: (training, [*overrides, f"algo={algo}"]) for algo in LEARNERS}) as turns:
             measured = beside(functools.partial(rate, step, config.num_envs, 0.5), turns, rounds)
         bare = median_reference([pair for pairs in measured.values() for pair in pairs])
         yield Row(name, "bare Batch.step", bare, "steps/s", 1.0, "of bare")

@@ -21,6 +21,7 @@ from mujoco.batch import Batch
 
 from hippo.envs import make
 
+CORES = os.sched_getaffinity(0)  # that this process may use
 Body = tuple[Any, ...]  # a function and its arguments but the last, which is called with the result of every iteration
 Pair = tuple[float, float]  # a speed, and the mean of the reference's just before and after it
 
@@ -46,6 +47,16 @@ class Row:
         figure = f"{self.figure:,.0f}" if self.figure >= 100 else f"{self.figure:.2f}"
         ratio = "" if self.ratio is None else f"{self.ratio:8.2f} {self.of}"
         return f"{self.where:24} {self.what:40} {figure:>10} {self.unit:8} {ratio}".rstrip()
+
+
+@contextlib.contextmanager
+def one_core() -> Iterator[None]:
+    """Keep this process and those it starts to one core: on a machine with neighbours no two are equally fast."""
+    os.sched_setaffinity(0, {max(CORES)})
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, CORES)
 
 
 def beside(

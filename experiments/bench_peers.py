@@ -2,10 +2,11 @@
 
 The same work: environment id, number of environments, steps, networks (policy 256-64, value 32-32, tanh), and ten
 full-batch gradient steps on policy and value per batch; one thread each, peers on our registered environment. Each
-takes an iteration in turn, with one of ours before and after it.
+takes an iteration in turn, with one of ours before and after it. SubprocVecEnv may use every core, the others one.
 """
 
 import functools
+import os
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -15,7 +16,16 @@ import torch
 from torch import nn
 
 from experiments.bench_iterations import training
-from experiments.bench_measure import Row, beside, contestants, median_ratio, median_reference, median_speed
+from experiments.bench_measure import (
+    CORES,
+    Row,
+    beside,
+    contestants,
+    median_ratio,
+    median_reference,
+    median_speed,
+    one_core,
+)
 from hippo.envs import gymnasium_id
 
 NUM_ENVS = {"block_hopper": 50, "ant_gather": 20}
@@ -28,6 +38,8 @@ def stable_baselines(name: str, num_envs: int, steps: int, processes: bool, repo
     from stable_baselines3 import PPO
     from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
+    if processes:
+        os.sched_setaffinity(0, CORES)
     one = functools.partial(_registered, name)
     envs = SubprocVecEnv([one] * num_envs, "fork") if processes else DummyVecEnv([one] * num_envs)
     learner = PPO(
@@ -121,7 +133,7 @@ def rows(quick: bool) -> Iterator[Row]:
             "Stable-Baselines3, SubprocVecEnv": (stable_baselines, name, num_envs, steps, True),
             "CleanRL-style, SyncVectorEnv": (clean_rl, name, num_envs, steps),
         }
-        with contestants(bodies) as turns:
+        with one_core(), contestants(bodies) as turns:
             ours = turns.pop("ours")
             measured = beside(lambda ours=ours: ours().speed, turns, rounds)  # type: ignore[misc]
         yield Row(name, "PPO, ours", median_reference(measured["CleanRL-style, SyncVectorEnv"]), "steps/s")

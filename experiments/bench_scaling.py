@@ -4,7 +4,7 @@ import statistics
 from collections.abc import Iterator
 
 from experiments.bench_iterations import Iteration, training
-from experiments.bench_measure import Row, beside, contestants
+from experiments.bench_measure import Row, beside, contestants, one_core
 
 ENV = "block_hopper"
 STEPS = 20_000  # of an iteration, unless it is the batch that changes
@@ -32,7 +32,10 @@ def rows(quick: bool) -> Iterator[Row]:
         "batch": (50_000, {n: overrides(50, batch_size=n) for n in (50_000, *batches)}, 2),
     }
     for what, (basis, settings, rounds) in cases.items():
-        with contestants({f"{what} {n:,}": (training, setting) for n, setting in settings.items()}) as turns:
+        with (
+            one_core(),
+            contestants({f"{what} {n:,}": (training, setting) for n, setting in settings.items()}) as turns,
+        ):
             reference = turns.pop(f"{what} {basis:,}")
             measured = beside(lambda turn=reference: cost(turn()), turns, 1 if quick else rounds)  # type: ignore[misc]
         for label, results in measured.items():

@@ -72,6 +72,7 @@ def state(run):
     return read_status(run.folder)["state"]
 
 
+@pytest.mark.timeout(600)  # every job compiles the kernels of its copy of the code
 def test_a_sweep_survives_a_kill_a_cancellation_and_a_restarted_node(long_run, cluster, tmp_path, capsys):
     profile = tmp_path / "profile.yaml"
     profile.write_text(yaml.safe_dump({"time_minutes": 30, "memory_gb": 1.0, "group_minutes": 0}))
