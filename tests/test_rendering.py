@@ -55,10 +55,10 @@ def test_walls_are_drawn_as_high_as_they_are(name):
     envs.reset(seed=0)
     renderer = Renderer(envs)
     envs.task.heights[:] = 0.1
-    envs.task._raise_walls(np.array([0]))
+    envs.task.raise_walls(np.array([0]))
     low = count(renderer.frame(0), 2, by=40)
     envs.task.heights[:] = 0.3
-    envs.task._raise_walls(np.array([0]))
+    envs.task.raise_walls(np.array([0]))
     high = count(renderer.frame(0), 2, by=40)
     renderer.close()
     assert 0 < low < high

@@ -180,6 +180,10 @@ class Blocks:
         for i, rng in zip(ids, layouts, strict=True):
             self.heights[i] = draw_heights(rng, self.track)
         self.cleared[ids] = self.ahead[ids] = 0
+        self.raise_walls(ids)
+
+    def raise_walls(self, ids: np.ndarray) -> None:
+        """Put the walls of simulations `ids` where they belong."""
         index = ring_indices(self.ahead[ids])
         self.physics.mocap_pos[ids] = ring_positions(index, self.heights[ids], self.track)
 
