@@ -27,15 +27,16 @@ def vectorised_by_gymnasium(
 ) -> None:
     """Report steps per second of SyncVectorEnv or AsyncVectorEnv over a registered single environment, without end."""
     vector = gym.vector.AsyncVectorEnv if processes else gym.vector.SyncVectorEnv
-    envs = vector([functools.partial(_registered, env_id)] * num_envs)
+    envs = vector([functools.partial(registered, env_id)] * num_envs)
     envs.reset(seed=0)
     actions = np.random.default_rng(0).uniform(-1, 1, envs.action_space.shape or ()).astype(np.float32)
     while True:
         report(rate(lambda: envs.step(actions), num_envs, seconds))
 
 
-def _registered(env_id: str) -> gym.Env:
-    import hippo.envs  # noqa: F401  registers the ids in a process of AsyncVectorEnv
+def registered(env_id: str) -> gym.Env:
+    """One environment by its Gymnasium id."""
+    import hippo.envs  # noqa: F401  registers the ids, also in a process of its own
 
     return gym.make(env_id)
 

@@ -9,12 +9,12 @@ import functools
 import os
 import time
 from collections.abc import Callable, Iterator
-from typing import Any
 
 import gymnasium as gym
 import torch
 from torch import nn
 
+from experiments.bench_environments import registered
 from experiments.bench_iterations import training
 from experiments.bench_measure import (
     CORES,
@@ -40,7 +40,7 @@ def stable_baselines(name: str, num_envs: int, steps: int, processes: bool, repo
 
     if processes:
         os.sched_setaffinity(0, CORES)
-    one = functools.partial(_registered, name)
+    one = functools.partial(registered, gymnasium_id(name))
     envs = SubprocVecEnv([one] * num_envs, "fork") if processes else DummyVecEnv([one] * num_envs)
     learner = PPO(
         "MlpPolicy",
@@ -58,12 +58,6 @@ def stable_baselines(name: str, num_envs: int, steps: int, processes: bool, repo
     )
     total = num_envs * steps
     _report(lambda: learner.learn(total, reset_num_timesteps=False), total, report)
-
-
-def _registered(name: str) -> Any:
-    import hippo.envs  # noqa: F401  registers the ids
-
-    return gym.make(gymnasium_id(name))
 
 
 def _report(iteration: Callable[[], object], steps: int, report: Report) -> None:
