@@ -21,7 +21,7 @@ from torch.nn.functional import cross_entropy
 from hippo.core import seeding
 from hippo.core.checkpoint import Checkpoint
 from hippo.core.log import RunLog
-from hippo.core.networks import ReLU, mlp
+from hippo.core.networks import mlp
 from hippo.core.normalize import Standardizer
 from hippo.core.policies import SkillPolicy
 from hippo.core.ppo import in_chunks
@@ -78,7 +78,7 @@ class Discriminator(nn.Module):
         super().__init__()
         self.seen = [i for i, name in enumerate(names) if name not in ABSOLUTE]
         self.inputs = Standardizer(len(self.seen))
-        self.net = mlp([len(self.seen), *hidden_sizes, num_skills], generator, ReLU)
+        self.net = mlp([len(self.seen), *hidden_sizes, num_skills], generator, nn.ReLU)
 
     def log_probs(self, obs: Tensor) -> Tensor:
         """log q(.|s): observations (B, D), the robot's first -> (B, Z)."""

@@ -7,7 +7,7 @@ at once.
 """
 
 import itertools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from fractions import Fraction
 from typing import Any
 
@@ -16,10 +16,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+Activation = type[nn.Tanh] | type[nn.ReLU]
 BLOCK = 131072  # entries of the widest activation of the rows that pass through all layers together: 512 kB
-SAME_BITS_TERMS = 192  # MKL adds up as many terms before it starts a new partial sum
-# MKL leaves AVX-512 unused on AMD's processors, where oneDNN takes half its time; with AVX2 MKL is the faster one.
-ONEDNN_IS_FASTER = torch.backends.mkldnn.is_available() and torch.backends.cpu.get_cpu_capability() == "AVX512"
 
 
 def _lambert(depth: int) -> tuple[tuple[np.float32, ...], tuple[np.float32, ...]]:
@@ -50,100 +48,109 @@ def _lambert_tanh(x: np.float32) -> np.float32:
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath={"contract"})
-def _tanh(x: np.ndarray, out: np.ndarray) -> None:
-    """Write tanh of x (n,) to out (n,), other memory; single precision by the fraction, in a sixth of numpy's time."""
-    if x.itemsize == 4:
-        for i in range(len(x)):
-            out[i] = _lambert_tanh(x[i])
-    else:
-        for i in range(len(x)):
-            out[i] = np.tanh(x[i])
+def _activate(y: np.ndarray, bias: np.ndarray, is_tanh: bool) -> None:
+    """Put tanh(y + bias), else max(y + bias, 0), in place of y: (B, H), (H,).
+
+    tanh is the fraction in single precision, a sixth of the time of numpy's.
+    """
+    for i in range(y.shape[0]):
+        if not is_tanh:
+            for j in range(y.shape[1]):
+                value = y[i, j] + bias[j]
+                y[i, j] = 0 if value < 0 else value  # NaN stays NaN
+        elif y.itemsize == 4:
+            for j in range(y.shape[1]):
+                y[i, j] = _lambert_tanh(y[i, j] + bias[j])
+        else:
+            for j in range(y.shape[1]):
+                y[i, j] = np.tanh(y[i, j] + bias[j])
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath={"contract"})
-def _tanh_in_place(x: np.ndarray) -> None:
-    """`_tanh` into its argument; a kernel of its own, because loops over memory that may overlap are not vectorised."""
-    if x.itemsize == 4:
-        for i in range(len(x)):
-            x[i] = _lambert_tanh(x[i])
-    else:
-        for i in range(len(x)):
-            x[i] = np.tanh(x[i])
+def _through_activation(gradient: np.ndarray, y: np.ndarray, is_tanh: bool) -> None:
+    """Put the gradient times the derivative where the activation is y, 1 - y^2 or y > 0, in its place: all (B, H)."""
+    for i in range(y.shape[0]):
+        if is_tanh:
+            for j in range(y.shape[1]):
+                gradient[i, j] -= gradient[i, j] * y[i, j] * y[i, j]
+        else:
+            for j in range(y.shape[1]):
+                gradient[i, j] = gradient[i, j] if y[i, j] > 0 else 0
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath={"contract"})
-def _through_tanh(gradient: np.ndarray, y: np.ndarray, out: np.ndarray) -> None:
-    """Write gradient (1 - y^2) to out; all (n,)."""
-    for i in range(len(y)):
-        out[i] = gradient[i] - gradient[i] * y[i] * y[i]
+Arrays = tuple[np.ndarray, ...]
 
 
-class Tanh(nn.Tanh):
-    """The hidden activation of all policies."""
+@numba.njit(cache=True, error_model="numpy")
+def _forward(
+    blocks: np.ndarray,
+    x: np.ndarray,
+    first: np.ndarray,
+    first_bias: np.ndarray,
+    weights: Arrays,
+    biases: Arrays,
+    is_tanh: bool,
+    kept: Arrays,
+    out: np.ndarray,
+) -> None:
+    """Fill `kept`, what the L hidden layers put out (B, H), and `out` (B, O), a block of rows after the other.
 
-    @staticmethod
-    def apply_to(x: Tensor, out: Tensor) -> None:
-        """tanh(x), written into `out`."""
-        _tanh(x.view(-1).numpy(), out.view(-1).numpy())
-
-    @staticmethod
-    def backward_to(gradient: Tensor, y: Tensor, out: Tensor) -> None:
-        """Times 1 - y^2, the derivative at the output y; written into `out`."""
-        _through_tanh(gradient.view(-1).numpy(), y.view(-1).numpy(), out.view(-1).numpy())
-
-
-class ReLU(nn.ReLU):
-    """The hidden activation of value functions."""
-
-    @staticmethod
-    def apply_to(x: Tensor, out: Tensor) -> None:
-        """max(x, 0), written into `out`."""
-        torch.clamp(x, min=0, out=out)
-
-    @staticmethod
-    def backward_to(gradient: Tensor, y: Tensor, out: Tensor) -> None:
-        """Times 1 where the output y is positive, else 0; written into `out`."""
-        torch.ops.aten.threshold_backward.grad_input(gradient, y, 0, grad_input=out)
-
-
-Activation = type[Tanh] | type[ReLU]
-
-
-def _by_onednn(weight: Tensor) -> bool:
-    """Whether oneDNN multiplies by this weight (H, D): where both give the same bits and it is faster.
-
-    The same bits: sums of at most 192 terms, at least 16 outputs (measured on AMD EPYCs of families 25 and 26).
+    Args:
+        blocks: (K, 3) group, first row, row after the last. x: (B, D). first: (Z, H, D). first_bias: (Z, H).
+        weights: L of (outputs, inputs). biases: L of (outputs,).
     """
-    outputs, inputs = weight.shape
-    return ONEDNN_IS_FASTER and outputs >= 16 and inputs <= SAME_BITS_TERMS and weight.dtype == torch.float32
+    for group, start, stop in blocks:
+        y = kept[0][start:stop]
+        np.dot(x[start:stop], first[group].T, y)
+        _activate(y, first_bias[group], is_tanh)
+        for layer in range(len(kept) - 1):
+            product = kept[layer + 1][start:stop]
+            np.dot(y, weights[layer].T, product)
+            _activate(product, biases[layer], is_tanh)
+            y = product
+        product = out[start:stop]
+        np.dot(y, weights[-1].T, product)
+        product += biases[-1]
 
 
-def _affine(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-    """x W^T + b: (B, D), (H, D), (H,) -> (B, H). The weight must be contiguous, which oneDNN takes for granted."""
-    if len(x) >= 4 and _by_onednn(weight):
-        return torch.ops.mkldnn._linear_pointwise(x, weight, bias, "none", [], "")
-    return torch.addmm(bias, x, weight.T)
+@numba.njit(cache=True, error_model="numpy")
+def _backward(
+    blocks: np.ndarray,
+    first: np.ndarray,
+    weights: Arrays,
+    is_tanh: bool,
+    kept: Arrays,
+    to_products: Arrays,
+    to_x: np.ndarray,
+) -> None:
+    """Fill the gradients with respect to x W^T + b of all layers but the last, which is given, and `to_x` if not empty.
 
-
-def _to_input(gradient: Tensor, weight: Tensor, transposed: Tensor) -> Tensor:
-    """The gradient with respect to the input of `_affine`: (B, H), (H, D), its contiguous transpose -> (B, D)."""
-    if len(gradient) >= 4 and len(weight) <= SAME_BITS_TERMS and _by_onednn(weight):
-        return torch.ops.mkldnn._linear_pointwise(gradient, transposed, None, "none", [], "")
-    return gradient @ weight
-
-
-def _blocks(counts: Sequence[int], width: int) -> Iterator[tuple[int, slice]]:
-    """(group, rows) of blocks of about BLOCK / width rows that cover groups of `counts` consecutive rows; none is tiny.
-
-    A few rows are multiplied by other routines, which round differently.
+    Args:
+        to_products: L + 1 of (B, outputs), the given one at the end. to_x: (B, D) or (0, D). The others as `_forward`.
     """
-    start = 0
+    for group, start, stop in blocks:
+        for layer in range(len(kept) - 1, -1, -1):
+            gradient = to_products[layer][start:stop]
+            np.dot(to_products[layer + 1][start:stop], weights[layer], gradient)
+            _through_activation(gradient, kept[layer][start:stop], is_tanh)
+        if len(to_x):
+            np.dot(to_products[0][start:stop], first[group], to_x[start:stop])
+
+
+def _blocks(counts: Sequence[int], width: int) -> np.ndarray:
+    """(group, first row, row after the last) of blocks of about BLOCK / width rows of one group each: (K, 3).
+
+    They cover groups of `counts` consecutive rows, and none is tiny: a few rows are multiplied by other routines, which
+    round differently.
+    """
+    blocks, start = [], 0
     for group, count in enumerate(counts):
         pieces = max(1, round(count * width / BLOCK))
         bounds = [start + count * i // pieces for i in range(pieces + 1)]
         if count:
-            yield from ((group, slice(*bound)) for bound in itertools.pairwise(bounds))
+            blocks += [(group, *bound) for bound in itertools.pairwise(bounds)]
         start += count
+    return np.array(blocks, np.int64).reshape(-1, 3)
 
 
 class _Layers(torch.autograd.Function):
@@ -154,38 +161,34 @@ class _Layers(torch.autograd.Function):
         x, (first, *weights) = x.contiguous(), (w.contiguous() for w in parameters[::2])
         first_bias, *biases = (b.contiguous() for b in parameters[1::2])
         kept = [x.new_empty(len(x), w.shape[1]) for w in weights]  # what every hidden layer puts out
-        for group, rows in _blocks(counts, max(w.shape[1] for w in weights)):
-            layers = [(first[group], first_bias[group]), *zip(weights, biases, strict=True)]
-            y = x[rows]
-            for (weight, bias), hidden in zip(layers, kept, strict=False):  # all but the last layer
-                product, y = _affine(y, weight, bias), hidden[rows]
-                activation.apply_to(product, y)
+        out = x.new_empty(len(x), len(biases[-1]))
+        ctx.blocks, ctx.counts = _blocks(counts, max(w.shape[1] for w in weights)), counts
+        ctx.is_tanh = activation is nn.Tanh
+        layers = (x.numpy(), first.numpy(), first_bias.numpy(), _numpy(weights), _numpy(biases))
+        _forward(ctx.blocks, *layers, ctx.is_tanh, _numpy(kept), out.numpy())
         ctx.save_for_backward(x, first, *weights, *kept)
-        ctx.counts, ctx.activation = counts, activation
-        # Over all rows at once: the rounding of narrow products depends on how many rows they have.
-        return _affine(kept[-1], weights[-1], biases[-1])
+        return out
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Any, ...]:
         x, first, *saved = ctx.saved_tensors
         weights, kept = saved[: len(saved) // 2], saved[len(saved) // 2 :]
-        transposed, first_transposed = [w.T.contiguous() for w in weights], first.transpose(1, 2).contiguous()
-        to_x = torch.empty_like(x) if ctx.needs_input_grad[0] else None
-        to_products = [*(torch.empty_like(y) for y in kept), gradients[0].contiguous()]  # what `_affine` returned
-        for group, rows in _blocks(ctx.counts, max(y.shape[1] for y in kept)):
-            gradient = to_products[-1][rows]
-            for weight, flipped, y, out in reversed([*zip(weights, transposed, kept, to_products[:-1], strict=True)]):
-                to_y, gradient = _to_input(gradient, weight, flipped), out[rows]
-                ctx.activation.backward_to(to_y, y[rows], gradient)
-            if to_x is not None:
-                to_x[rows] = _to_input(gradient, first[group], first_transposed[group])
+        to_x = torch.empty_like(x) if ctx.needs_input_grad[0] else x[:0]
+        to_products = [*(torch.empty_like(y) for y in kept), gradients[0].contiguous()]  # with respect to x W^T + b
+        layers = (first.numpy(), _numpy(weights), ctx.is_tanh, _numpy(kept))
+        _backward(ctx.blocks, *layers, _numpy(to_products), to_x.numpy())
+        # Sums over all rows are torch's: MKL is faster where the first factor is transposed.
         to_first, to_first_bias = torch.empty_like(first), first.new_empty(first.shape[:2])
         groups = zip(to_products[0].split(ctx.counts), x.split(ctx.counts), strict=True)
         for group, (gradient, inputs) in enumerate(groups):
             to_first[group] = (inputs.T @ gradient).T  # twice as fast as gradient.T @ inputs where inputs are few
             to_first_bias[group] = gradient.sum(0)
         others = [part for y, g in zip(kept, to_products[1:], strict=True) for part in (g.T @ y, g.sum(0))]
-        return to_x, None, None, to_first, to_first_bias, *others
+        return to_x if ctx.needs_input_grad[0] else None, None, None, to_first, to_first_bias, *others
+
+
+def _numpy(tensors: Sequence[Tensor]) -> Arrays:
+    return tuple(t.numpy() for t in tensors)
 
 
 def grouped_layers(
@@ -220,13 +223,13 @@ class MLP(nn.Sequential):
         first, *rest = self.layers
         if not rest:
             return first(x)
-        rows, activation = x.reshape(-1, x.shape[-1]), Tanh if isinstance(self[1], Tanh) else ReLU
+        rows, activation = x.reshape(-1, x.shape[-1]), nn.Tanh if isinstance(self[1], nn.Tanh) else nn.ReLU
         weight, bias = first.weight.unsqueeze(0), first.bias.unsqueeze(0)
         y = grouped_layers(rows, [len(rows)], weight, bias, rest, activation)
         return y.view(*x.shape[:-1], y.shape[-1])
 
 
-def mlp(sizes: Sequence[int], generator: torch.Generator, activation: Activation = Tanh) -> MLP:
+def mlp(sizes: Sequence[int], generator: torch.Generator, activation: Activation = nn.Tanh) -> MLP:
     """Layers sizes[0] -> ... -> sizes[-1] with `activation` between them and none after the last."""
     modules: list[nn.Module] = []
     for inputs, outputs in itertools.pairwise(sizes):
@@ -244,17 +247,17 @@ def linear(inputs: int, outputs: int, generator: torch.Generator) -> nn.Linear:
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath={"contract"})
-def _few_rows(x: np.ndarray, weights: tuple[np.ndarray, ...], biases: tuple[np.ndarray, ...]) -> np.ndarray:
+def _few_rows(x: np.ndarray, weights: Arrays, biases: Arrays) -> np.ndarray:
     """Layers of weights (D, H), biases (H,) and tanh between them, over rows (N, D) -> (N, O)."""
-    for layer in range(len(weights)):
-        if layer:
-            _tanh_in_place(x.reshape(-1))
+    for layer in range(len(weights) - 1):
         x = np.dot(x, weights[layer])
-        x += biases[layer]
+        _activate(x, biases[layer], True)
+    x = np.dot(x, weights[-1])
+    x += biases[-1]
     return x
 
 
-def _arrays(layers: Sequence[nn.Linear]) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]:
+def _arrays(layers: Sequence[nn.Linear]) -> tuple[Arrays, Arrays]:
     """Weights (D, H) and biases (H,) of layers as they are now."""
     weights = tuple(np.ascontiguousarray(layer.weight.detach().numpy().T) for layer in layers)
     return weights, tuple(layer.bias.detach().numpy().copy() for layer in layers)
@@ -267,30 +270,27 @@ def for_few_rows(net: MLP) -> Callable[[np.ndarray], np.ndarray]:
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath={"contract"})
-def _grouped_layer(x: np.ndarray, group: np.ndarray, weight: np.ndarray, bias: np.ndarray, out: np.ndarray) -> None:
-    """Write x_i W_z + b_z for the group z of every row to out (N, H): x (N, D), group (N,), (Z, D, H), (Z, H)."""
+def _few_grouped_rows(
+    x: np.ndarray, group: np.ndarray, first: np.ndarray, first_bias: np.ndarray, weights: Arrays, biases: Arrays
+) -> np.ndarray:
+    """`_few_rows` behind a first layer of the group's own: (N, D), (N,), (Z, D, H), (Z, H) -> (N, O)."""
+    hidden = first_bias[group]
     for i in range(len(x)):
-        z = group[i]
-        out[i] = bias[z]
         for d in range(x.shape[1]):
-            for h in range(out.shape[1]):
-                out[i, h] += x[i, d] * weight[z, d, h]
+            entry, weight = x[i, d], first[group[i], d]
+            for h in range(hidden.shape[1]):
+                hidden[i, h] += entry * weight[h]
+    _activate(hidden, np.zeros_like(first_bias[0]), True)
+    return _few_rows(hidden, weights, biases)
 
 
 def for_few_grouped_rows(
     first_weight: Tensor, first_bias: Tensor, rest: Sequence[nn.Linear]
 ) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
     """The function that `grouped_layers` with tanh computes now, rows (N, D) in any order and their groups (N,)."""
-    weights, biases = _arrays(rest)
-    weight, bias = first_weight.detach().transpose(1, 2).contiguous().numpy(), first_bias.detach().numpy().copy()
-
-    def forward(x: np.ndarray, group: np.ndarray) -> np.ndarray:
-        hidden = np.empty((len(x), bias.shape[1]), x.dtype)
-        _grouped_layer(np.ascontiguousarray(x), group, weight, bias, hidden)
-        _tanh_in_place(hidden.reshape(-1))
-        return _few_rows(hidden, weights, biases)
-
-    return forward
+    first = first_weight.detach().transpose(1, 2).contiguous().numpy(), first_bias.detach().numpy().copy()
+    rest_of_it = _arrays(rest)
+    return lambda x, group: _few_grouped_rows(np.ascontiguousarray(x), group, *first, *rest_of_it)
 
 
 class SkillLinear(nn.Module):

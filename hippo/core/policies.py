@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from hippo.core.networks import SkillLinear, Tanh, for_few_grouped_rows, for_few_rows, grouped_layers, mlp
+from hippo.core.networks import SkillLinear, for_few_grouped_rows, for_few_rows, grouped_layers, mlp
 
 MIN_STD = 1e-4  # floor of the standard deviation (authors' code)
 
@@ -210,7 +210,7 @@ class SkillPolicy(nn.Module):
     def log_prob(self, obs: Tensor, skill: Tensor, action: Tensor) -> Tensor:
         """log pi_l(a|s, z) of rows *sorted by skill*: (B, D), (B,), (B, A) -> (B,)."""
         counts = torch.bincount(skill, minlength=self.num_skills).tolist()
-        mean = grouped_layers(obs, counts, *self.first.effective(), self.rest.layers, Tanh)
+        mean = grouped_layers(obs, counts, *self.first.effective(), self.rest.layers, nn.Tanh)
         return grouped_gaussian_log_prob(mean, self.log_std(), action, counts)
 
     def log_prob_all(self, obs: Tensor, action: Tensor) -> Tensor:
@@ -220,5 +220,5 @@ class SkillPolicy(nn.Module):
     def means(self, obs: Tensor) -> Tensor:
         """Mean action of every skill: (B, D) -> (B, Z, A)."""
         rows, counts = obs.repeat(self.num_skills, 1), [len(obs)] * self.num_skills
-        mean = grouped_layers(rows, counts, *self.first.effective(), self.rest.layers, Tanh)
+        mean = grouped_layers(rows, counts, *self.first.effective(), self.rest.layers, nn.Tanh)
         return mean.view(self.num_skills, len(obs), -1).transpose(0, 1)

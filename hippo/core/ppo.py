@@ -1,4 +1,4 @@
-"""The clipped surrogate of PPO (Schulman et al. 2017, equation 7) and a full-batch step taken in cache-sized chunks."""
+"""The clipped surrogate of PPO (Schulman et al. 2017, equation 7) and a full-batch step taken in chunks."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-CHUNK = 8192  # rows per forward and backward pass: activations of one layer stay in a core's second-level cache
+CHUNK = 25_000  # rows per forward and backward pass; bounds the memory of their activations
 
 
 def clipped_surrogate(log_prob: Tensor, old_log_prob: Tensor, advantage: Tensor, clip_range: float) -> Tensor:
@@ -23,9 +23,10 @@ def surrogate_statistics(log_prob: Tensor, old_log_prob: Tensor, clip_range: flo
 
 
 def chunks(rows: int) -> Iterator[slice]:
-    """Consecutive slices of at most CHUNK rows that cover range(rows)."""
-    for start in range(0, rows, CHUNK):
-        yield slice(start, min(start + CHUNK, rows))
+    """Consecutive slices of at most CHUNK rows, all of about the same size, that cover range(rows)."""
+    parts = -(-rows // CHUNK)
+    for part in range(parts):
+        yield slice(rows * part // parts, rows * (part + 1) // parts)
 
 
 def in_chunks(function: Callable[[slice], Tensor], rows: int) -> Tensor:

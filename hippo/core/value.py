@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from hippo.core.networks import ReLU, SkillLinear, grouped_layers, linear, mlp
+from hippo.core.networks import SkillLinear, grouped_layers, linear, mlp
 from hippo.core.normalize import Standardizer
 from hippo.core.ppo import chunks, in_chunks
 
@@ -37,8 +37,8 @@ class ValueFunction(nn.Module):
             self.first = SkillLinear(input_size, num_skills, hidden_sizes[0], "bilinear", generator)
         else:
             self.first = linear(input_size, hidden_sizes[0], generator)
-        after_first = mlp([*hidden_sizes, 1], generator, ReLU)
-        self.rest, self._layers = nn.Sequential(ReLU(), after_first), after_first.layers
+        after_first = mlp([*hidden_sizes, 1], generator, nn.ReLU)
+        self.rest, self._layers = nn.Sequential(nn.ReLU(), after_first), after_first.layers
         self.inputs, self.target = Standardizer(input_size), Standardizer(1)
         self.is_fitted: Tensor
         self.register_buffer("is_fitted", torch.tensor(False))
@@ -50,7 +50,7 @@ class ValueFunction(nn.Module):
             counts, first = torch.bincount(skill, minlength=self.num_skills).tolist(), self.first.effective()
         else:
             counts, first = [len(x)], (self.first.weight.unsqueeze(0), self.first.bias.unsqueeze(0))
-        return grouped_layers(x, counts, *first, self._layers, ReLU).squeeze(-1)
+        return grouped_layers(x, counts, *first, self._layers, nn.ReLU).squeeze(-1)
 
     def _sorted(self, x: Tensor, skill: Tensor | None) -> tuple[Tensor, Tensor | None, Tensor | None]:
         if not self.num_skills:
