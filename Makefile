@@ -63,7 +63,7 @@ lint: install  ## ruff (format and rules) and mypy
 	$(BIN)/mypy
 
 test: install  ## every test but the slow ones
-	$(PY) pytest -m "not slow and not slurm and not browser"
+	$(PY) pytest -m "not slow and not slurm and not browser" --numprocesses logical --maxprocesses 4 --dist loadfile
 
 test-slow: install  ## the tests that take minutes
 	$(PY) pytest -m slow -s

@@ -37,7 +37,7 @@ class Part:
 
 
 PARTS = {
-    "iterations": Part(bench_iterations.rows, 480, 60),
+    "iterations": Part(bench_iterations.rows, 640, 60),
     "environments": Part(bench_environments.rows, 80, 20),
     "peers": Part(bench_peers.rows, 150, 20),
     "scaling": Part(bench_scaling.rows, 220, 60),

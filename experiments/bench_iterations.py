@@ -122,7 +122,7 @@ def rows(quick: bool) -> Iterator[Row | str]:
             overrides, rounds = [*overrides, *budget], 1
         step, _ = stepping(name, config.num_envs)
         with one_core(), contestants({algo: (training, [*overrides, f"algo={algo}"]) for algo in LEARNERS}) as turns:
-            measured = beside(functools.partial(rate, step, config.num_envs, 0.5), turns, rounds)
+            measured = beside(functools.partial(rate, step, config.num_envs, 0.5 if quick else 2.0), turns, rounds)
         bare = median_reference([pair for pairs in measured.values() for pair in pairs])
         yield Row(name, "bare Batch.step", bare, "steps/s", 1.0, "of bare")
         for algo, learner in LEARNERS.items():

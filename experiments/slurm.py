@@ -238,10 +238,11 @@ def snapshot(folder: Path) -> Path:
     target = folder / f"code-{digest.hexdigest()[:12]}"
     if not target.exists():
         temporary = folder / f"{target.name}.{os.getpid()}.tmp"
-        for path in files:
+        compiled = ROOT.glob("hippo/**/__pycache__/*.nb?")  # numba's kernels: 15 seconds that no job need spend
+        for path in [*files, *compiled]:
             copy = temporary / path.relative_to(ROOT)
             copy.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copy(path, copy)
+            shutil.copy2(path, copy)  # with its time: a kernel is as good as new while its source's is the same
         (temporary / "snapshot.json").write_text(json.dumps(code_version()))
         temporary.rename(target)
     return target

@@ -85,6 +85,13 @@ def finished(tmp_path):
     return {p.parent.name for p in (tmp_path / "runs").glob("*/status.json") if '"finished"' in p.read_text()}
 
 
+def is_worker(process):
+    try:
+        return "spawn_main" in " ".join(process.cmdline())
+    except psutil.NoSuchProcess:  # it has just ended
+        return False
+
+
 def test_six_workers_killed_at_random_leave_no_trace_once_the_command_was_typed_again(tmp_path):
     (tmp_path / "a").mkdir()
     (tmp_path / "b").mkdir()
@@ -96,7 +103,7 @@ def test_six_workers_killed_at_random_leave_no_trace_once_the_command_was_typed_
         if process is None or process.poll() is not None:
             process, typed = start_sweep(tmp_path / "b", 25, EIGHT), typed + 1
         time.sleep(rng.uniform(0.2, 1.0))
-        workers = [w for w in psutil.Process(process.pid).children() if "spawn_main" in " ".join(w.cmdline())]
+        workers = [child for child in psutil.Process(process.pid).children() if is_worker(child)]
         folders = [path.parent for path in (tmp_path / "b/runs").glob("*/status.json")]
         training = {status["pid"] for status in map(read_status, folders) if status["state"] == "running"}
         if kills < 6 and (chosen := [w for w in workers if w.pid in training]):

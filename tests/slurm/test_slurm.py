@@ -5,6 +5,8 @@ import json
 import os
 import signal
 import stat
+import subprocess
+import sys
 import tempfile
 import time
 from pathlib import Path
@@ -135,6 +137,23 @@ def test_the_code_that_jobs_run_is_a_copy(tmp_path):
     assert (copy / "experiments/train.py").read_bytes() == Path(slurm.__file__).with_name("train.py").read_bytes()
     assert "git_commit" in json.loads((copy / "snapshot.json").read_text())
     assert slurm.snapshot(tmp_path) == copy
+
+
+def test_jobs_find_the_kernels_that_were_compiled_before(tmp_path):
+    code = """
+import numpy as np
+from hippo.core import policies
+policies.sample_categorical(np.zeros((1, 2)), np.zeros(1))
+print(policies.__file__, sum(policies._sample_categorical.stats.cache_misses.values()))"""
+
+    def compiled_in(folder):
+        output = subprocess.run([sys.executable, "-c", code], cwd=folder, check=True, capture_output=True, text=True)
+        path, misses = output.stdout.split()
+        assert Path(path).is_relative_to(folder)
+        return int(misses)
+
+    compiled_in(slurm.ROOT)
+    assert compiled_in(slurm.snapshot(tmp_path)) == 0
 
 
 def test_a_cluster_that_does_not_answer_is_one_clear_error(cluster, tmp_path, monkeypatch, capsys):
