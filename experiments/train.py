@@ -123,7 +123,7 @@ def prepare(run: Run) -> Callable[[int, str], Any]:
     """Set torch up and return what makes the run's environments, each purpose with its own random stream."""
     torch.set_num_threads(1)
     torch.use_deterministic_algorithms(True)
-    # Nothing is read before it is written (the tests, which keep this, would see NaN), so the filling would be in vain.
+    # Filling fresh memory would be in vain: nothing is read before it is written (tests/test_golden.py sees to it).
     torch.utils.deterministic.fill_uninitialized_memory = False  # type: ignore[attr-defined]
 
     def make_envs(num_envs: int, purpose: str) -> Any:

@@ -46,6 +46,20 @@ def test_a_learners_numbers_are_the_stored_ones_of_its_revision(name, tmp_path):
         np.testing.assert_allclose(column, stored["metrics"][key], rtol=1e-3, atol=1e-4, err_msg=f"{name}: {key}")
 
 
+@pytest.mark.parametrize("name", LEARNERS)
+def test_nothing_is_read_before_it_is_written(name, tmp_path, monkeypatch):
+    """Training does without it (experiments/train.py): torch's deterministic mode fills fresh memory with NaN."""
+    plain = metrics(name, tmp_path / "plain")
+    monkeypatch.setattr(torch.utils.deterministic, "fill_uninitialized_memory", True)
+    torch.use_deterministic_algorithms(True)
+    try:
+        assert torch.empty(1000).isnan().all()
+        filled = metrics(name, tmp_path / "filled")
+    finally:
+        torch.use_deterministic_algorithms(False)
+    assert filled == plain
+
+
 def test_the_tolerance_still_sees_a_change_of_one_percent_in_the_learning_rate(tmp_path):
     stored = json.loads(path_of("ppo").read_text())["metrics"]
     train, config = learner("ppo", iterations=3, batch_size=400)

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor, nn
 
 Activation = type[nn.Tanh] | type[nn.ReLU]
+Arrays = tuple[np.ndarray, ...]
 BLOCK = 131072  # entries of the widest activation of the rows that pass through all layers together: 512 kB
 
 
@@ -76,9 +77,6 @@ def _through_activation(gradient: np.ndarray, y: np.ndarray, is_tanh: bool) -> N
         else:
             for j in range(y.shape[1]):
                 gradient[i, j] = gradient[i, j] if y[i, j] > 0 else 0
-
-
-Arrays = tuple[np.ndarray, ...]
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -289,8 +287,8 @@ def for_few_grouped_rows(
 ) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
     """The function that `grouped_layers` with tanh computes now, rows (N, D) in any order and their groups (N,)."""
     first = first_weight.detach().transpose(1, 2).contiguous().numpy(), first_bias.detach().numpy().copy()
-    rest_of_it = _arrays(rest)
-    return lambda x, group: _few_grouped_rows(np.ascontiguousarray(x), group, *first, *rest_of_it)
+    behind = _arrays(rest)
+    return lambda x, group: _few_grouped_rows(np.ascontiguousarray(x), group, *first, *behind)
 
 
 class SkillLinear(nn.Module):
