@@ -23,7 +23,7 @@ from hippo.core.minibatch import maximize_in_minibatches, minibatches
 from hippo.core.normalize import standardize
 from hippo.core.options import Execution, OptionPolicy, Options
 from hippo.core.policies import gaussian_entropy
-from hippo.core.ppo import Level, clipped_surrogate, in_chunks, surrogate_statistics
+from hippo.core.ppo import Level, Rows, clipped_surrogate, in_chunks, surrogate_statistics
 from hippo.core.rollout import Steps
 from hippo.core.settings import ConfigError, check, setting
 from hippo.core.skills import start_from
@@ -323,12 +323,12 @@ def improve(
     rows, size = len(data.option), config.minibatch_size
     epochs, clip_range = config.updates, config.clip_range
 
-    def log_prob(c: slice) -> Tensor:
+    def log_prob(c: Rows) -> Tensor:
         return policy.skills.log_prob(data.seen[c, : policy.robot_size], data.option[c], data.action[c])
 
     level = Level("skill", log_prob, data.advantage)
     parts = rows // size if size else 1
-    maximize_in_minibatches(level, optimizers["skill"], epochs, parts, clip_range, rows, generator)
+    maximize_in_minibatches([level], optimizers["skill"], epochs, parts, clip_range, rows, generator)
 
     def critic_loss(i: Tensor) -> Tensor:
         return (of_option(policy.critic(data.seen[i]), data.option[i]) - data.returns[i]).square().mean()

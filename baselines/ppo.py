@@ -4,7 +4,6 @@ One Gaussian policy sees the whole observation. With `action_repeat` p an action
 its episode, rewards are summed, and one step of the algorithm is one held action, as in the authors' wrapper.
 """
 
-import dataclasses
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,11 +18,13 @@ from hippo.core import seeding
 from hippo.core.checkpoint import Checkpoint
 from hippo.core.gae import segment_gae
 from hippo.core.log import RunLog, check_finite
-from hippo.core.normalize import standardize
+from hippo.core.minibatch import Critic
+from hippo.core.normalize import RewardScale, actor_of, standardize
+from hippo.core.on_policy import SurrogateConfig, improve, make_optimizer
 from hippo.core.policies import GaussianPolicy, gaussian_entropy
-from hippo.core.ppo import Level, maximize
+from hippo.core.ppo import Level, Rows
 from hippo.core.rollout import Steps
-from hippo.core.settings import ConfigError, check, setting
+from hippo.core.settings import ConfigError, setting
 from hippo.core.value import ValueFunction, explained_variance
 
 REVISION = 1  # bumped by every change that alters the metrics of tests/golden
@@ -32,16 +33,9 @@ MakeEnvs = Callable[[int, str], Any]  # (num_envs, purpose) -> a vector environm
 
 
 @dataclass
-class PPOConfig:
-    """Every setting of flat PPO; the defaults are the paper's, then the authors' code's."""
+class PPOConfig(SurrogateConfig):
+    """The settings of flat PPO beside those of the surrogate; the defaults are the paper's."""
 
-    iterations: int = setting(dataclasses.MISSING, "training iterations", code="2000 on Gather (README)", low=1)
-    batch_size: int = setting(
-        dataclasses.MISSING, "environment steps per iteration", paper="Block 50 000, Gather 100 000 (App. A)", low=1
-    )
-    horizon: int = setting(
-        dataclasses.MISSING, "episode length H in steps", paper="Block 1000, Ant 5000, Snake 8000 (App. A)", low=1
-    )
     action_repeat: int = setting(
         1,
         "environment steps for which one action is held",
@@ -54,42 +48,12 @@ class PPOConfig:
         "whether gamma counts environment steps rather than held actions",
         code="held actions: gamma is not adjusted (action_repeating_env2.py:35)",
     )
-    learning_rate: float = setting(3e-3, "Adam step size", paper="3e-3 (App. A)", above=0.0)
-    clip_range: float = setting(0.1, "clipping parameter epsilon", paper="0.1 (App. A)", above=0.0)
-    updates: int = setting(
-        10, "full-batch gradient steps per iteration", paper="10 (App. A)", code="80, 10 by flag", low=1
-    )
-    gamma: float = setting(0.999, "discount", paper="0.999 (App. A)", code="0.99, 0.999 by flag", above=0.0, high=1.0)
-    gae_lambda: float = setting(
-        1.0, "GAE lambda", paper="cites GAE, gives no value", code="1 (hier_batch_polopt.py:55)", low=0.0, high=1.0
-    )
-    bootstrap_horizon: bool = setting(
-        False,
-        "whether the end of the horizon bootstraps the value",
-        paper="finite-horizon MDP (section 2)",
-        code="no (hier_base.py:57)",
-    )
     hidden_sizes: list[int] = setting([256, 64], "policy's hidden layers", paper="256, 64 (App. A)", low=1)
-    value_hidden_sizes: list[int] = setting([32, 32], "hidden layers of the baseline", paper="2 x 32 (App. A)", low=1)
-    value_iterations: int = setting(
-        10,
-        "the most loss evaluations that the fit of a baseline may use per iteration",
-        code="KL-constrained L-BFGS, up to 20 iterations x 10 penalties",
-        ours="bounds the cost of an iteration; 20 explain the next batch no better (docs/performance.md)",
-        low=1,
-    )
 
     def __post_init__(self) -> None:
-        check(self)
-        if self.batch_size < self.horizon:
-            raise ConfigError("batch_size", self.batch_size, f"must be at least one horizon, {self.horizon} steps")
+        super().__post_init__()
         if self.action_repeat > self.horizon:
             raise ConfigError("action_repeat", self.action_repeat, f"must be at most the horizon, {self.horizon} steps")
-
-    @property
-    def num_envs(self) -> int:
-        """Slots that collect one horizon each; ceil(batch / horizon)."""
-        return -(-self.batch_size // self.horizon)
 
 
 @torch.no_grad()
@@ -115,8 +79,8 @@ def collect(
     is_decision = np.empty((T, N), bool)
     action = np.empty((N, steps.action.shape[-1]), np.float32)
     steps_left = np.zeros(N, np.int64)
-    act = policy.actor()
-    obs = steps.reset(seeding.integer(seed, "episodes", iteration))
+    act, view = policy.actor(), actor_of(policy.filter)
+    obs = view(steps.reset(seeding.integer(seed, "episodes", iteration)))
     for t in range(T):
         is_decision[t] = steps_left == 0
         where = np.flatnonzero(is_decision[t])
@@ -126,18 +90,25 @@ def collect(
             action[where] = act(obs[where], noise[t][where])
         steps_left[where] = config.action_repeat
         obs, done = steps.step(t, action)
+        obs = view(obs)
         steps_left -= 1
         steps_left[done] = 0
+    steps.see_through(policy.filter)
     return steps, torch.from_numpy(is_decision)
+
+
+def make_policy(config: PPOConfig, envs: gym.vector.VectorEnv, generator: torch.Generator) -> GaussianPolicy:
+    """A fresh policy for `envs`."""
+    obs_size, action_size = envs.single_observation_space.shape[0], envs.single_action_space.shape[0]  # type: ignore[index]
+    how = (config.normalize_observations, config.initialisation)
+    return GaussianPolicy(obs_size, action_size, config.hidden_sizes, generator, *how)
 
 
 def rollout(
     config: PPOConfig, envs: gym.vector.VectorEnv, seed: int, checkpoint: Checkpoint, greedy: bool = False
 ) -> Steps:
     """One horizon in every environment with the policy of a checkpoint; nothing is learnt."""
-    obs_size, action_size = envs.single_observation_space.shape[0], envs.single_action_space.shape[0]  # type: ignore[index]
-    generator = seeding.torch_generator(0, "overwritten by the checkpoint")
-    policy = GaussianPolicy(obs_size, action_size, config.hidden_sizes, generator)
+    policy = make_policy(config, envs, seeding.torch_generator(0, "overwritten by the checkpoint"))
     checkpoint.restore(policy=policy)
     return collect(policy, envs, config, seed, 0, greedy)[0]
 
@@ -149,13 +120,17 @@ def train(config: PPOConfig, make_envs: MakeEnvs, log: RunLog, seed: int, checkp
         Diverged: an observation, a reward or a parameter is no longer finite.
     """
     envs = make_envs(config.num_envs, "training")
-    obs_size, action_size = envs.single_observation_space.shape[0], envs.single_action_space.shape[0]
-    generator = seeding.torch_generator(seed, "initialisation")
-    policy = GaussianPolicy(obs_size, action_size, config.hidden_sizes, generator)
-    baseline = ValueFunction(obs_size, config.value_hidden_sizes, generator)
-    optimizer = torch.optim.Adam(policy.parameters(), lr=config.learning_rate)
+    obs_size, generator = envs.single_observation_space.shape[0], seeding.torch_generator(seed, "initialisation")
+    policy = make_policy(config, envs, generator)
+    how = (0, config.initialisation, config.values_in_loop)
+    baseline = ValueFunction(obs_size, config.value_hidden_sizes, generator, *how)
+    trained = [*policy.parameters(), *(baseline.parameters() if config.values_in_loop else ())]
+    optimizer = make_optimizer(config, trained)
 
-    parts = {"policy": policy, "baseline": baseline, "optimizer": optimizer}
+    parts: dict[str, Any] = {"policy": policy, "baseline": baseline, "optimizer": optimizer}
+    reward_scale = RewardScale() if config.scale_rewards else None
+    if reward_scale is not None:
+        parts["reward_scale"] = reward_scale
     first = checkpoint.restore(**parts)
     log.resume(first)
 
@@ -170,11 +145,13 @@ def train(config: PPOConfig, make_envs: MakeEnvs, log: RunLog, seed: int, checkp
                 "action_std": float(policy.log_std.exp().mean()),
             }
 
+        if reward_scale is not None:
+            steps.scaled_reward = reward_scale(steps.reward, steps.done, config.gamma)
         value = baseline.predict(steps.obs)
         final_obs, step, env = steps.final()
         next_value = value[1:].index_put((step, env), baseline.predict(final_obs))
         advantage = segment_gae(
-            steps.reward,
+            steps.scaled_reward,
             value[:-1],
             next_value,
             steps.terminated,
@@ -190,13 +167,25 @@ def train(config: PPOConfig, make_envs: MakeEnvs, log: RunLog, seed: int, checkp
             advantage + value[:-1][is_decision],
         )
 
-        def log_prob(c: slice, obs: Tensor = obs, action: Tensor = action) -> Tensor:
+        def log_prob(c: Rows, obs: Tensor = obs, action: Tensor = action) -> Tensor:
             return policy.log_prob(obs[c], action[c])
 
-        level = Level("policy", log_prob, standardize(advantage).to(obs.dtype))
-        losses = maximize([level], optimizer, config.updates, config.clip_range, len(obs))
+        def predicted(c: Rows, obs: Tensor = obs) -> Tensor:
+            return baseline.output(obs[c])
+
+        level = Level(
+            "policy",
+            log_prob,
+            standardize(advantage).to(obs.dtype),
+            entropy=lambda _: gaussian_entropy(policy.log_std),
+        )
+        critics = [Critic(predicted, target.to(obs.dtype))] if config.values_in_loop else []
+        losses = improve(config, [level], critics, optimizer, policy.filter, len(obs), seed, iteration)
         explained = explained_variance(value[:-1][is_decision], target)
-        baseline.fit(obs, target, config.value_iterations)
+        if not config.values_in_loop:
+            baseline.fit(obs, target, config.value_iterations)
+        if policy.filter is not None:
+            policy.filter.update(steps.raw_obs[:-1])
         check_finite(iteration, parameters=nn.utils.parameters_to_vector(policy.parameters()))
         end = time.perf_counter()
 

@@ -10,6 +10,7 @@ where k runs over the manager's decisions and t over environment steps. Where to
     settings of the hierarchy (n, p, networks)     hippo/core/hierarchy.py   HierarchyConfig
     advantages and both baselines (section 4.2)    hippo/core/advantages.py  advantages
     the clipped surrogate L^CLIP                   hippo/core/ppo.py         clipped_surrogate, maximize
+    minibatches, running statistics (modern)       hippo/core/on_policy.py   SurrogateConfig, improve
     Lemma 1: exact and approximate gradient        hippo/gradients.py
     Algorithm 2, HiPPO                             here                      train
 """
@@ -19,7 +20,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-import torch
 from torch import nn
 
 from hippo.core import seeding
@@ -27,7 +27,7 @@ from hippo.core.advantages import Baselines, advantages
 from hippo.core.checkpoint import Checkpoint
 from hippo.core.hierarchy import HierarchicalPolicy, HierarchyConfig, collect, levels, policy_statistics, rollout
 from hippo.core.log import RunLog, check_finite
-from hippo.core.ppo import maximize
+from hippo.core.on_policy import SurrogateConfig, improve, make_optimizer
 from hippo.core.settings import ConfigError, setting
 from hippo.core.skills import start_from
 
@@ -39,14 +39,9 @@ MakeEnvs = Callable[[int, str], Any]  # (num_envs, purpose) -> a vector environm
 
 
 @dataclass
-class HippoConfig(HierarchyConfig):
-    """The settings of HiPPO beside those of its hierarchy; the defaults are the paper's."""
+class HippoConfig(SurrogateConfig, HierarchyConfig):
+    """The settings of HiPPO beside those of its hierarchy and of the surrogate; the defaults are the paper's."""
 
-    learning_rate: float = setting(3e-3, "Adam step size", paper="3e-3 (App. A)", above=0.0)
-    clip_range: float = setting(0.1, "clipping parameter epsilon of both levels", paper="0.1 (App. A)", above=0.0)
-    updates: int = setting(
-        10, "full-batch gradient steps per iteration", paper="10 (App. A)", code="80, 10 by flag", low=1
-    )
     train_manager: bool = setting(True, "update the manager", paper="yes; Fig. 6 compares")
     train_skills: bool = setting(True, "update the skills, log-std included", paper="yes; Fig. 6 compares")
 
@@ -72,11 +67,13 @@ def train(config: HippoConfig, make_envs: MakeEnvs, log: RunLog, seed: int, chec
     generator = seeding.torch_generator(seed, "initialisation")
     policy = HierarchicalPolicy(config, obs_size, envs.robot_size, action_size, generator)
     start_from(config.skills, policy.skills, envs)
-    baselines = Baselines(config, obs_size, generator)
+    baselines = Baselines(config, obs_size, generator, in_loop=config.values_in_loop)
     # A frozen level stays out of the optimiser, log-std included.
     networks = {"manager": policy.manager, "skill": policy.skills}
     trained = [p for name in config.trained_levels for p in networks[name].parameters()]
-    optimizer = torch.optim.Adam(trained, lr=config.learning_rate)
+    if config.values_in_loop:
+        trained += baselines.parameters()
+    optimizer = make_optimizer(config, trained)
 
     parts = {"policy": policy, "baselines": baselines, "optimizer": optimizer}
     first = checkpoint.restore(**parts)
@@ -89,10 +86,15 @@ def train(config: HippoConfig, make_envs: MakeEnvs, log: RunLog, seed: int, chec
         steps.check(iteration)
         collected = time.perf_counter()
         statistics = policy_statistics(policy, batch)  # of the policy that collected, before its update
+        baselines.scale_rewards(steps, config.gamma)
         estimate = advantages(batch, baselines, config)
         objective = levels(policy, batch, estimate.manager, estimate.skills, config.trained_levels)
-        losses = maximize(objective, optimizer, config.updates, config.clip_range, steps.num_steps)
-        baselines.fit(batch, estimate.returns)
+        critics = baselines.critics(batch, estimate.returns) if config.values_in_loop else []
+        losses = improve(config, objective, critics, optimizer, policy.filter, steps.num_steps, seed, iteration)
+        if not config.values_in_loop:
+            baselines.fit(batch, estimate.returns)
+        if policy.filter is not None:
+            policy.filter.update(steps.raw_obs[:-1])
         check_finite(iteration, parameters=nn.utils.parameters_to_vector(policy.parameters()))
         end = time.perf_counter()
 

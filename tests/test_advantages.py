@@ -13,9 +13,11 @@ from tests.toy import TargetEnv
 
 def hand_batch(terminated, done, final=None):
     """Four steps of one environment, decisions at 0 and 2 (p = 2), skills 0 then 1, rewards 1 2 3 4."""
+    reward = torch.tensor([[1.0], [2.0], [3.0], [4.0]], dtype=torch.float64)
     steps = SimpleNamespace(
         obs=torch.arange(5.0).view(5, 1, 1),
-        reward=torch.tensor([[1.0], [2.0], [3.0], [4.0]], dtype=torch.float64),
+        reward=reward,
+        scaled_reward=reward,
         terminated=torch.tensor(terminated).view(4, 1),
         done=torch.tensor(done).view(4, 1),
         final=lambda: (torch.empty(0, 1), torch.empty(0, dtype=torch.long), torch.empty(0, dtype=torch.long)),

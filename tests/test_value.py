@@ -45,14 +45,14 @@ def test_a_fit_finds_a_smooth_function_and_reports_its_error():
 def test_a_fit_uses_no_more_evaluations_than_allowed_and_never_gets_worse(monkeypatch):
     value = ValueFunction(2, [8, 8], generator())
     x, calls = torch.randn(100, 2, generator=generator(1)), 0
-    forward = ValueFunction._standardized
+    forward = ValueFunction.output
 
     def counted(self, rows, skill):
         nonlocal calls
         calls += 1
         return forward(self, rows, skill)
 
-    monkeypatch.setattr(ValueFunction, "_standardized", counted)
+    monkeypatch.setattr(ValueFunction, "output", counted)
     errors = []
     for budget in (1, 3, 20):
         calls = 0

@@ -1,24 +1,36 @@
 """Advantages of both levels and the baselines they come from (paper section 4.2, Lemma 2)."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from hippo.core.gae import gae, segment_gae
-from hippo.core.hierarchy import Batch, HierarchyConfig, with_time
-from hippo.core.normalize import standardize
+from hippo.core.hierarchy import Batch, HierarchyConfig, rows_by_skill, with_time
+from hippo.core.minibatch import Critic
+from hippo.core.normalize import RewardScale, standardize
+from hippo.core.ppo import Rows
+from hippo.core.rollout import Steps
 from hippo.core.value import ValueFunction, explained_variance
 
 
 class Baselines(nn.Module):
-    """V(s) and V(s, z, time left); a baseline of either kind leaves the expected gradient unchanged (Lemma 2)."""
+    """V(s) and V(s, z, time left); a baseline of either kind leaves the expected gradient unchanged (Lemma 2).
 
-    def __init__(self, config: HierarchyConfig, obs_size: int, generator: torch.Generator) -> None:
+    Args:
+        in_loop: an optimiser trains them in the minibatches of the policy, `fit` does not.
+    """
+
+    def __init__(
+        self, config: HierarchyConfig, obs_size: int, generator: torch.Generator, in_loop: bool = False
+    ) -> None:
         super().__init__()
         self.evaluations = config.value_iterations
-        self.single = ValueFunction(obs_size, config.value_hidden_sizes, generator)
-        self.skill = ValueFunction(obs_size + 1, config.value_hidden_sizes, generator, config.num_skills)
+        sizes, initialisation = config.value_hidden_sizes, config.initialisation
+        self.single = ValueFunction(obs_size, sizes, generator, 0, initialisation, in_loop)
+        self.skill = ValueFunction(obs_size + 1, sizes, generator, config.num_skills, initialisation, in_loop)
+        self.reward_scale = RewardScale() if config.scale_rewards else None
 
     def inputs(self, kind: str, obs: Tensor, time_left: Tensor, skill: Tensor) -> tuple[Tensor, Tensor | None]:
         """What the baseline `kind` sees: its rows and, for the skill-conditioned one, their skills."""
@@ -29,6 +41,26 @@ class Baselines(nn.Module):
         if kind == "none":
             return torch.zeros(time_left.shape, dtype=torch.float64)
         return getattr(self, kind).predict(*self.inputs(kind, obs, time_left, skill))
+
+    def scale_rewards(self, steps: Steps, gamma: float) -> None:
+        """Let the levels learn from scaled rewards, if that is the setting."""
+        if self.reward_scale is not None:
+            steps.scaled_reward = self.reward_scale(steps.reward, steps.done, gamma)
+
+    def critics(self, batch: Batch, returns: dict[str, Tensor]) -> list[Critic]:
+        """The baselines in use over the rows that `levels` has, sorted by skill."""
+        rows = rows_by_skill(batch)
+        result = []
+        for kind, target in returns.items():
+            columns = (batch.steps.obs, batch.time_left, batch.skill)
+            x, skill = self.inputs(kind, *(c[:-1].flatten(0, 1)[rows] for c in columns))
+            value = getattr(self, kind).output
+
+            def output(c: Rows, x: Tensor = x, skill: Tensor | None = skill, value: Any = value) -> Tensor:
+                return value(x[c], None if skill is None else skill[c])
+
+            result.append(Critic(output, target.flatten()[rows].to(x.dtype)))
+        return result
 
     def fit(self, batch: Batch, returns: dict[str, Tensor]) -> None:
         """Refit the baselines in use to this batch, for the next iteration."""
@@ -58,7 +90,7 @@ def advantages(batch: Batch, baselines: Baselines, config: HierarchyConfig) -> A
     steps, used = batch.steps, batch.used
     # A step whose successor is not used ends its episode: what truncate_to_period drops does not exist.
     ends = used & ~torch.cat([used[1:], torch.ones_like(used[:1])]) | ~used
-    reward, terminated, done = steps.reward * used, steps.terminated | ends, steps.done | ends
+    reward, terminated, done = steps.scaled_reward * used, steps.terminated | ends, steps.done | ends
     final_obs, step, env = steps.final()
     value, next_value, advantage = {}, {}, {}
     for kind in sorted({config.manager_baseline, config.skill_baseline}):

@@ -3,7 +3,6 @@
 HiPPO, HierVPG and MLSH train this same hierarchy and differ in what they do with a batch of it.
 """
 
-import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -16,26 +15,22 @@ from torch import Tensor, nn
 
 from hippo.core import seeding
 from hippo.core.checkpoint import Checkpoint
-from hippo.core.policies import Manager, SkillPolicy, gaussian_entropy, sample_categorical
-from hippo.core.ppo import Level
+from hippo.core.networks import normalize_columns
+from hippo.core.normalize import ObservationFilter, actor_of
+from hippo.core.on_policy import OnPolicyConfig
+from hippo.core.policies import POLICY_HEAD, Manager, SkillPolicy, gaussian_entropy, sample_categorical
+from hippo.core.ppo import Level, Rows
 from hippo.core.rollout import Steps
-from hippo.core.settings import ConfigError, check, setting
+from hippo.core.settings import ConfigError, setting
 
 
 @dataclass
-class HierarchyConfig:
-    """What every algorithm that trains a hierarchy sets: budget, commitment, networks, baselines, discounting.
+class HierarchyConfig(OnPolicyConfig):
+    """What every algorithm that trains a hierarchy sets beside the rest: commitment, networks and what levels see.
 
     The defaults are the paper's and, where it is silent, the authors' code's.
     """
 
-    iterations: int = setting(dataclasses.MISSING, "training iterations", code="2000 on Gather (README)", low=1)
-    batch_size: int = setting(
-        dataclasses.MISSING, "environment steps per iteration", paper="Block 50 000, Gather 100 000 (App. A)", low=1
-    )
-    horizon: int = setting(
-        dataclasses.MISSING, "episode length H in steps", paper="Block 1000, Ant 5000, Snake 8000 (App. A)", low=1
-    )
     num_skills: int = setting(6, "number of skills n", paper="6 (App. A)", code="6 (pg_test.py:332)", low=1)
     period_min: int = setting(
         5, "shortest commitment in steps; equal to period_max: a fixed period", paper="5 (App. A)", low=1
@@ -54,34 +49,14 @@ class HierarchyConfig:
         paper="single (section 4.2)",
         choices=("single", "none"),
     )
-    gamma: float = setting(
-        0.999, "discount per environment step", paper="0.999 (App. A)", code="0.99, 0.999 by flag", above=0, high=1
-    )
-    gae_lambda: float = setting(
-        1.0, "GAE lambda", paper="cites GAE, gives no value", code="1 (hier_batch_polopt.py:55)", low=0, high=1
-    )
     manager_advantage: str = setting(
         "step",
         "advantage of a decision: the per-step advantage where it is made, or semi-Markov GAE; equal for lambda 1",
         code="step (hippo2.py:186)",
         choices=("step", "smdp"),
     )
-    bootstrap_horizon: bool = setting(
-        False,
-        "whether the end of the horizon bootstraps the value",
-        paper="finite-horizon MDP (section 2)",
-        code="no (hier_base.py:57)",
-    )
     manager_hidden_sizes: list[int] = setting([32, 32], "manager's hidden layers", paper="2 x 32 (App. A)", low=1)
     skill_hidden_sizes: list[int] = setting([64, 64], "skill network's hidden layers", paper="2 x 64 (App. A)", low=1)
-    value_hidden_sizes: list[int] = setting([32, 32], "hidden layers of both baselines", paper="2 x 32 (App. A)", low=1)
-    value_iterations: int = setting(
-        10,
-        "the most loss evaluations that the fit of a baseline may use per iteration",
-        code="KL-constrained L-BFGS, up to 20 iterations x 10 penalties",
-        ours="bounds the cost of an iteration; 20 explain the next batch no better (docs/performance.md)",
-        low=1,
-    )
     skill_integration: str = setting(
         "bilinear",
         "how the skill enters the skill network",
@@ -112,18 +87,11 @@ class HierarchyConfig:
     )
 
     def __post_init__(self) -> None:
-        check(self)
+        super().__post_init__()
         if self.period_min > self.period_max:
             raise ConfigError("period_min", self.period_min, f"must be at most period_max={self.period_max}")
-        if self.batch_size < self.horizon:
-            raise ConfigError("batch_size", self.batch_size, f"must be at least one horizon, {self.horizon} steps")
         if self.truncate_to_period and self.period_min < self.period_max:
             raise ConfigError("truncate_to_period", True, "needs a fixed period (period_min = period_max)")
-
-    @property
-    def num_envs(self) -> int:
-        """Slots that collect one horizon each; ceil(batch / horizon)."""
-        return -(-self.batch_size // self.horizon)
 
 
 def with_time(obs: Tensor, time_left: Tensor) -> Tensor:
@@ -134,7 +102,8 @@ def with_time(obs: Tensor, time_left: Tensor) -> Tensor:
 class HierarchicalPolicy(nn.Module):
     """Manager and skills, and what each of them sees of an observation and the time left.
 
-    Only with a random period do the two see the time left (authors' code: fixed-p networks do not).
+    Only with a random period do the two see the time left (authors' code: fixed-p networks do not). Observations are
+    those that `collect` records: where the policy has a filter, they have passed it.
     """
 
     def __init__(
@@ -142,6 +111,7 @@ class HierarchicalPolicy(nn.Module):
     ) -> None:
         super().__init__()
         self.num_skills = config.num_skills
+        self.filter = ObservationFilter(obs_size) if config.normalize_observations else None
         self.skill_view = robot_size if config.skill_observation == "robot" else obs_size
         self.sees_time = config.period_min < config.period_max
         extra = int(self.sees_time)
@@ -155,6 +125,9 @@ class HierarchicalPolicy(nn.Module):
             config.skill_integration,
             config.log_std_per_skill,
         )
+        if config.initialisation == "normc":
+            normalize_columns(self.manager.logits.layers, POLICY_HEAD, generator)
+            normalize_columns([self.skills.first, *self.skills.rest.layers], POLICY_HEAD, generator)
 
     def manager_input(self, obs: Tensor, time_left: Tensor) -> Tensor:
         """(..., D), (...) -> (..., D [+ 1])."""
@@ -271,16 +244,18 @@ def collect(
     time_left = np.empty((T + 1, N), np.float32)
     is_decision = np.empty((T + 1, N), bool)
 
-    act, everywhere = policy.skills.actor(), np.arange(N)
+    act, view, everywhere = policy.skills.actor(), actor_of(policy.filter), np.arange(N)
     commitment = Commitment(policy, N, config.period_max)
-    obs = steps.reset(seeding.integer(seed, "episodes", iteration))
+    obs = view(steps.reset(seeding.integer(seed, "episodes", iteration)))
     for t in range(T + 1):
         is_decision[t] = commitment.renew(obs, period[t], None if greedy else uniform[t])
         skill[t], time_left[t] = commitment.skill, commitment.time_left
         if t < T:
             seen = look(obs, commitment.time_left, everywhere, policy.skill_view, policy.sees_time)
             obs, done = steps.step(t, act(seen, skill[t], noise[t]))
+            obs = view(obs)
             commitment.advance(done)
+    steps.see_through(policy.filter)
 
     decisions, used = torch.from_numpy(is_decision), torch.ones_like(steps.done)
     if config.truncate_to_period:
@@ -311,6 +286,12 @@ def in_whole_periods(is_decision: Tensor, period: int) -> Tensor:
     return length.gather(0, segment) == period
 
 
+def rows_by_skill(batch: Batch) -> Tensor:
+    """Which of the flattened (T N) steps are learnt from, sorted by skill as the skill network wants."""
+    used = batch.used.flatten().nonzero().squeeze(-1)
+    return used[batch.skill[:-1].flatten()[used].argsort(stable=True)]
+
+
 def levels(
     policy: HierarchicalPolicy,
     batch: Batch,
@@ -320,29 +301,40 @@ def levels(
 ) -> list[Level]:
     """Log-probabilities and advantages of both levels: the manager at its decisions, the skills at every step.
 
+    Rows of the skills are sorted by skill; `at` says which of them hold a decision, and which.
+
     Args:
         manager_advantage, skill_advantage: (T, N). trained: the levels to return.
     """
     result = []
-    obs, skill, time_left = batch.steps.obs[:-1], batch.skill[:-1], batch.time_left[:-1]
+    obs, skill, time_left = (x[:-1].flatten(0, 1) for x in (batch.steps.obs, batch.skill, batch.time_left))
+    rows = rows_by_skill(batch)
     if "manager" in trained:
-        where = batch.is_decision[:-1] & batch.used
+        where = (batch.is_decision[:-1] & batch.used).flatten()
         manager_input, choice = policy.manager_input(obs[where], time_left[where]), skill[where].unsqueeze(-1)
+        decision = torch.where(where, where.cumsum(0) - 1, -1)[rows]
 
-        def manager_log_prob(c: slice) -> Tensor:
+        def manager_log_prob(c: Rows) -> Tensor:
             return policy.manager.log_probs(manager_input[c]).gather(-1, choice[c]).squeeze(-1)
 
-        result.append(Level("manager", manager_log_prob, manager_advantage[where].to(obs.dtype)))
-    if "skill" in trained:
-        used = batch.used
-        order = skill[used].argsort(stable=True)  # the skill network wants its rows sorted by skill
-        skill_input = policy.skill_input(obs[used], time_left[used])[order]
-        active, action = skill[used][order], batch.steps.action[used][order]
+        def manager_entropy(c: Rows) -> Tensor:
+            log_probs = policy.manager.log_probs(manager_input[c])
+            return -(log_probs.exp() * log_probs).sum(-1).mean()
 
-        def skill_log_prob(c: slice) -> Tensor:
+        advantage = manager_advantage.flatten()[where].to(obs.dtype)
+        result.append(Level("manager", manager_log_prob, advantage, manager_entropy, decision))
+    if "skill" in trained:
+        skill_input, active = policy.skill_input(obs[rows], time_left[rows]), skill[rows]
+        action = batch.steps.action.flatten(0, 1)[rows]
+
+        def skill_log_prob(c: Rows) -> Tensor:
             return policy.skills.log_prob(skill_input[c], active[c], action[c])
 
-        result.append(Level("skill", skill_log_prob, skill_advantage[used][order].to(obs.dtype)))
+        def skill_entropy(c: Rows) -> Tensor:
+            return gaussian_entropy(policy.skills.log_std())[active[c]].mean()
+
+        advantage = skill_advantage.flatten()[rows].to(obs.dtype)
+        result.append(Level("skill", skill_log_prob, advantage, skill_entropy))
     return result
 
 

@@ -244,6 +244,22 @@ def linear(inputs: int, outputs: int, generator: torch.Generator) -> nn.Linear:
     return layer
 
 
+@torch.no_grad()
+def normalize_columns(layers: "Sequence[nn.Linear | SkillLinear]", last: float, generator: torch.Generator) -> None:
+    """Draw the layers of a network anew: Gaussian weights of norm one per output, `last` in the last layer; no bias.
+
+    What OpenAI Baselines call normc: a small last layer makes a policy start as pure noise around zero. The weights of
+    a skill layer are scaled so that the norm is one, in root mean square, over what a single skill lets through.
+    """
+    for layer in layers:
+        weight, active = torch.empty_like(layer.weight).normal_(generator=generator), 1.0
+        if isinstance(layer, SkillLinear):
+            active = layer.active_inputs / weight.shape[1]
+        scale = (last if layer is layers[-1] else 1.0) / active**0.5
+        layer.weight.copy_(scale * weight / weight.norm(dim=1, keepdim=True))
+        layer.bias.zero_()
+
+
 @numba.njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _few_rows(x: np.ndarray, weights: Arrays, biases: Arrays) -> np.ndarray:
     """Layers of weights (D, H), biases (H,) and tanh between them, over rows (N, D) -> (N, O)."""
@@ -308,6 +324,11 @@ class SkillLinear(nn.Module):
         width = inputs + num_skills + (inputs * num_skills if integration == "bilinear" else 0)
         layer = linear(width, outputs, generator)
         self.weight, self.bias = layer.weight, layer.bias  # (H, width), (H,)
+
+    @property
+    def active_inputs(self) -> int:
+        """How many of its inputs the one-hot skill lets be other than zero."""
+        return self.inputs * (2 if self.integration == "bilinear" else 1) + 1
 
     def effective(self) -> tuple[Tensor, Tensor]:
         """The weight (Z, H, D) and the bias (Z, H) that the one-hot input leaves for each skill."""

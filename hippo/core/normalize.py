@@ -1,9 +1,15 @@
-"""Standardisation: of advantages over a batch, and of a regression's inputs and targets."""
+"""Standardisation: of advantages over a batch, of a regression's inputs and targets, and by running statistics."""
 
+from collections.abc import Callable
+
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 EPSILON = 1e-8  # added to every standard deviation (the authors' constant)
+FILTER_RANGE = 5.0  # filtered observations are clipped to +- this (OpenAI baselines)
+FILTER_MIN_STD = 0.1  # floor of a column's standard deviation (OpenAI baselines)
+REWARD_RANGE = 10.0  # scaled rewards are clipped to +- this (Stable-Baselines3)
 
 
 def standardize(x: Tensor) -> Tensor:
@@ -40,3 +46,78 @@ class Standardizer(nn.Module):
     def invert(self, y: Tensor) -> Tensor:
         """The inverse of `forward`."""
         return y * self.scale + self.mean
+
+
+class RunningMoments(nn.Module):
+    """Mean and variance of the columns of all rows ever taken in, in float64 (Chan, Golub and LeVeque 1979)."""
+
+    count: Tensor
+    mean: Tensor
+    variance: Tensor
+
+    def __init__(self, size: int) -> None:
+        super().__init__()
+        self.register_buffer("count", torch.zeros((), dtype=torch.float64))
+        self.register_buffer("mean", torch.zeros(size, dtype=torch.float64))
+        self.register_buffer("variance", torch.ones(size, dtype=torch.float64))
+
+    def update(self, x: Tensor) -> None:
+        """Take in rows `x` (..., size)."""
+        x = x.reshape(-1, x.shape[-1]).double()
+        total = self.count + len(x)
+        share, shift = len(x) / total, x.mean(0) - self.mean
+        within = (1 - share) * self.variance + share * x.var(0, correction=0)
+        self.variance.copy_(within + share * (1 - share) * shift.square())
+        self.mean.add_(share * shift)
+        self.count.copy_(total)
+
+
+class ObservationFilter(RunningMoments):
+    """Standardises by the mean and the standard deviation of all observations that `update` has seen, and clips.
+
+    Exactly the identity until the first update. Learners update it with a batch after they have learnt from it, so a
+    whole batch is seen through the same statistics; whatever only acts leaves them alone.
+    """
+
+    def _shift_and_scale(self) -> tuple[Tensor, Tensor]:
+        return self.mean.float(), self.variance.sqrt().clamp(min=FILTER_MIN_STD).float()
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(..., D) -> (..., D)."""
+        if not self.count:
+            return x
+        shift, scale = self._shift_and_scale()
+        return ((x - shift) / scale).clamp(-FILTER_RANGE, FILTER_RANGE)
+
+    def actor(self) -> Callable[[np.ndarray], np.ndarray]:
+        """The same function in numpy, for the statistics as they are now."""
+        if not self.count:
+            return lambda x: x
+        shift, scale = (x.numpy() for x in self._shift_and_scale())
+        return lambda x: np.clip((x - shift) / scale, -FILTER_RANGE, FILTER_RANGE)
+
+
+def actor_of(observation_filter: ObservationFilter | None) -> Callable[[np.ndarray], np.ndarray]:
+    """What a policy with this filter, or with none, sees of observations (N, D)."""
+    return (lambda x: x) if observation_filter is None else observation_filter.actor()
+
+
+class RewardScale(RunningMoments):
+    """Divides rewards by the running standard deviation of the discounted sums of past rewards, and clips.
+
+    The sums are those of Engstrom et al. (2020), section 3: G_t = r_t + gamma G_{t-1}, from zero at every episode's
+    start. The batch at hand counts, so that the first reward ever seen is not divided by almost nothing.
+    """
+
+    def __init__(self) -> None:
+        super().__init__(1)
+
+    def forward(self, reward: Tensor, done: Tensor, gamma: float) -> Tensor:
+        """Take in rewards and episode ends (T, N) of a batch that starts with fresh episodes; scaled rewards (T, N)."""
+        sums, running = torch.empty_like(reward), torch.zeros_like(reward[0])
+        for t in range(len(reward)):
+            running = reward[t] + gamma * running
+            sums[t] = running
+            running = running.masked_fill(done[t], 0.0)
+        self.update(sums.unsqueeze(-1))
+        return (reward / (self.variance.sqrt() + EPSILON)).clamp(-REWARD_RANGE, REWARD_RANGE)

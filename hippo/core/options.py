@@ -4,7 +4,7 @@ An option is an intra-option policy pi(a|s, o) that goes on until its terminatio
 at; then the policy over options pi_Omega(o|s) chooses the next. Q(s, o) values a state under the option in force.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,55 +12,9 @@ import torch
 from torch import Tensor, nn
 
 from hippo.core.networks import for_few_rows, mlp
+from hippo.core.normalize import ObservationFilter
 from hippo.core.policies import Manager, SkillPolicy, sample_categorical
 from hippo.core.rollout import Steps
-
-FILTER_RANGE = 5.0  # filtered observations are clipped to +- this (OpenAI baselines)
-FILTER_MIN_STD = 0.1  # floor of a column's standard deviation (OpenAI baselines)
-
-
-class ObservationFilter(nn.Module):
-    """Standardises by the mean and the standard deviation of all observations that `update` has seen, and clips.
-
-    Exactly the identity until the first update.
-    """
-
-    count: Tensor
-    mean: Tensor
-    variance: Tensor
-
-    def __init__(self, size: int) -> None:
-        super().__init__()
-        self.register_buffer("count", torch.zeros((), dtype=torch.float64))
-        self.register_buffer("mean", torch.zeros(size, dtype=torch.float64))
-        self.register_buffer("variance", torch.ones(size, dtype=torch.float64))
-
-    def update(self, x: Tensor) -> None:
-        """Take in rows `x` (..., D)."""
-        x = x.reshape(-1, x.shape[-1]).double()
-        total = self.count + len(x)
-        share, shift = len(x) / total, x.mean(0) - self.mean
-        within = (1 - share) * self.variance + share * x.var(0, correction=0)
-        self.variance.copy_(within + share * (1 - share) * shift.square())
-        self.mean.add_(share * shift)
-        self.count.copy_(total)
-
-    def _shift_and_scale(self) -> tuple[Tensor, Tensor]:
-        return self.mean.float(), self.variance.sqrt().clamp(min=FILTER_MIN_STD).float()
-
-    def forward(self, x: Tensor) -> Tensor:
-        """(..., D) -> (..., D)."""
-        if not self.count:
-            return x
-        shift, scale = self._shift_and_scale()
-        return ((x - shift) / scale).clamp(-FILTER_RANGE, FILTER_RANGE)
-
-    def actor(self) -> Callable[[np.ndarray], np.ndarray]:
-        """The same function in numpy, for the statistics as they are now."""
-        if not self.count:
-            return lambda x: x
-        shift, scale = (x.numpy() for x in self._shift_and_scale())
-        return lambda x: np.clip((x - shift) / scale, -FILTER_RANGE, FILTER_RANGE)
 
 
 class OptionPolicy(nn.Module):

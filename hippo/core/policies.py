@@ -12,9 +12,18 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from hippo.core.networks import SkillLinear, for_few_grouped_rows, for_few_rows, grouped_layers, mlp
+from hippo.core.networks import (
+    SkillLinear,
+    for_few_grouped_rows,
+    for_few_rows,
+    grouped_layers,
+    mlp,
+    normalize_columns,
+)
+from hippo.core.normalize import ObservationFilter
 
 MIN_STD = 1e-4  # floor of the standard deviation (authors' code)
+POLICY_HEAD = 0.01  # norm of a policy's last weights under `initialisation=normc` (OpenAI Baselines)
 
 
 def gaussian_log_prob(mean: Tensor, log_std: Tensor, action: Tensor) -> Tensor:
@@ -124,13 +133,27 @@ def _sample_categorical(logits: np.ndarray, uniform: np.ndarray, out: np.ndarray
 
 
 class GaussianPolicy(nn.Module):
-    """The flat policy pi(a|s): mean from an MLP, one trainable log-std vector."""
+    """The flat policy pi(a|s): mean from an MLP, one trainable log-std vector.
+
+    Args:
+        filtered: observations pass a running standardisation before the policy, and whoever learns with it, sees them.
+        initialisation: "glorot" or "normc", as in `OnPolicyConfig`.
+    """
 
     def __init__(
-        self, obs_size: int, action_size: int, hidden_sizes: Sequence[int], generator: torch.Generator
+        self,
+        obs_size: int,
+        action_size: int,
+        hidden_sizes: Sequence[int],
+        generator: torch.Generator,
+        filtered: bool = False,
+        initialisation: str = "glorot",
     ) -> None:
         super().__init__()
+        self.filter = ObservationFilter(obs_size) if filtered else None
         self.mean = mlp([obs_size, *hidden_sizes, action_size], generator)
+        if initialisation == "normc":
+            normalize_columns(self.mean.layers, POLICY_HEAD, generator)
         self.log_std_parameter = nn.Parameter(torch.zeros(action_size))
 
     @property

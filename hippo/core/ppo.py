@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+Rows = slice | Tensor  # which rows of a batch: a slice, or their indices
 CHUNK = 25_000  # rows per forward and backward pass; bounds the memory of their activations
 
 
@@ -40,8 +41,10 @@ class Level:
     """One policy's share of a clipped objective: its log-probability of what it did, and how good that was."""
 
     name: str  # prefix of the metrics
-    log_prob: Callable[[slice], Tensor]  # rows -> log-probability under the current parameters
+    log_prob: Callable[[Rows], Tensor]  # rows -> log-probability under the current parameters
     advantage: Tensor  # (B,)
+    entropy: Callable[[Rows], Tensor] | None = None  # rows -> mean entropy there, for learners that reward it
+    at: Tensor | None = None  # which of its rows belongs to every row of a minibatch, -1 for none; None: the same
 
 
 def maximize(
@@ -55,7 +58,8 @@ def maximize(
         Per level, at the last gradient evaluated: `<name>_approx_kl`, `<name>_clip_fraction`; and `surrogate`, the
         objective there.
     """
-    metrics: dict[str, float] = {}
+    metrics = {f"{level.name}_{what}": 0.0 for level in levels for what in ("approx_kl", "clip_fraction")}
+    metrics["surrogate"] = 0.0
     old_log_prob = [torch.empty_like(level.advantage) for level in levels]  # filled by the first update
     for update in range(updates):
         optimizer.zero_grad(set_to_none=True)

@@ -19,7 +19,7 @@ from hippo.core.gae import gae
 from hippo.core.log import RunLog, check_finite
 from hippo.core.normalize import standardize
 from hippo.core.policies import SkillPolicy, gaussian_entropy
-from hippo.core.ppo import Level, maximize
+from hippo.core.ppo import Level, Rows, maximize
 from hippo.core.rollout import LastInfo, Steps
 from hippo.core.settings import ConfigError, check, setting
 from hippo.core.value import ValueFunction, explained_variance
@@ -205,7 +205,7 @@ def update(
     rows, active = obs[:-1].flatten(0, 1)[order], skill[:-1].flatten()[order]
     action = steps.action.flatten(0, 1)[order]
 
-    def log_prob(c: slice) -> Tensor:
+    def log_prob(c: Rows) -> Tensor:
         return policy.log_prob(rows[c], active[c], action[c])
 
     level = Level("skill", log_prob, standardize(advantage).flatten()[order].to(rows.dtype))

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from hippo.core.episodes import episode_statistics
 from hippo.core.log import check_finite
+from hippo.core.normalize import ObservationFilter
 
 
 class LastInfo(gym.vector.VectorWrapper):
@@ -74,6 +75,7 @@ class Steps:
         names = ("obs", "action", "reward", "terminated", "done")
         self._write = {name: getattr(self, name).numpy() for name in names}
         self._final: list[tuple[int, np.ndarray, np.ndarray]] = []
+        self.raw_obs, self.scaled_reward = self.obs, self.reward  # before an observation filter, after a reward scale
         self.diverged = 0  # simulations that diverged
         self.penalty = 0.0  # velocity penalty summed over all steps
         self.physics_seconds = 0.0  # spent inside the environments
@@ -107,6 +109,13 @@ class Steps:
             self.penalty += float(info["velocity_penalty"].sum())
         return obs, done
 
+    def see_through(self, observation_filter: ObservationFilter | None) -> None:
+        """Turn the observations into what a policy with this filter saw of them; `raw_obs` keeps them as they were."""
+        if observation_filter is not None:
+            self.obs = observation_filter(self.raw_obs)
+            view = observation_filter.actor()
+            self._final = [(t, where, view(obs)) for t, where, obs in self._final]
+
     @property
     def num_steps(self) -> int:
         """Environment steps taken, T N."""
@@ -130,7 +139,7 @@ class Steps:
 
     def check(self, iteration: int) -> None:
         """Raise Diverged where an observation or a reward is not finite."""
-        check_finite(iteration, observations=self.obs, rewards=self.reward)
+        check_finite(iteration, observations=self.raw_obs, rewards=self.reward)
 
     def timing(self, start: float, collected: float, end: float) -> dict[str, float]:
         """Where the seconds between `start`, `collected` and `end` (perf_counter) of an iteration went."""

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from hippo.core.networks import SkillLinear, grouped_layers, linear, mlp
+from hippo.core.networks import SkillLinear, grouped_layers, linear, mlp, normalize_columns
 from hippo.core.normalize import Standardizer
 from hippo.core.ppo import chunks, in_chunks
 
@@ -22,13 +22,23 @@ class _BudgetSpent(Exception):
 
 
 class ValueFunction(nn.Module):
-    """V(x), or V(x, z) where `num_skills` is given; predicts zero until it has been fitted once.
+    """V(x), or V(x, z) where `num_skills` is given.
 
-    With skills the first layer's input is [x, z, x (x) z], where x already holds the remaining time.
+    Either it is fitted, and predicts zero until it has been once; or, `in_loop`, an optimiser trains it by `output` and
+    it predicts that. With skills the first layer's input is [x, z, x (x) z], where x already holds the remaining time.
+
+    Args:
+        initialisation: "glorot" or "normc", as in `OnPolicyConfig`.
     """
 
     def __init__(
-        self, input_size: int, hidden_sizes: Sequence[int], generator: torch.Generator, num_skills: int = 0
+        self,
+        input_size: int,
+        hidden_sizes: Sequence[int],
+        generator: torch.Generator,
+        num_skills: int = 0,
+        initialisation: str = "glorot",
+        in_loop: bool = False,
     ) -> None:
         super().__init__()
         self.num_skills = num_skills
@@ -39,12 +49,14 @@ class ValueFunction(nn.Module):
             self.first = linear(input_size, hidden_sizes[0], generator)
         after_first = mlp([*hidden_sizes, 1], generator, nn.ReLU)
         self.rest, self._layers = nn.Sequential(nn.ReLU(), after_first), after_first.layers
+        if initialisation == "normc":
+            normalize_columns([self.first, *self._layers], 1.0, generator)
         self.inputs, self.target = Standardizer(input_size), Standardizer(1)
         self.is_fitted: Tensor
-        self.register_buffer("is_fitted", torch.tensor(False))
+        self.register_buffer("is_fitted", torch.tensor(in_loop))
 
-    def _standardized(self, x: Tensor, skill: Tensor | None) -> Tensor:
-        """Standardised values of standardised rows sorted by skill: (B, D), (B,) -> (B,)."""
+    def output(self, x: Tensor, skill: Tensor | None = None) -> Tensor:
+        """Values of rows sorted by skill, in the units of what the network is trained on: (B, D), (B,) -> (B,)."""
         if isinstance(self.first, SkillLinear):
             assert skill is not None
             counts, first = torch.bincount(skill, minlength=self.num_skills).tolist(), self.first.effective()
@@ -68,7 +80,7 @@ class ValueFunction(nn.Module):
         rows, sorted_skill, order = self._sorted(x, None if skill is None else skill.reshape(-1))
 
         def part(c: slice) -> Tensor:
-            return self._standardized(self.inputs(rows[c]), None if sorted_skill is None else sorted_skill[c])
+            return self.output(self.inputs(rows[c]), None if sorted_skill is None else sorted_skill[c])
 
         value = in_chunks(part, len(rows))
         if order is not None:
@@ -104,7 +116,7 @@ class ValueFunction(nn.Module):
                 p.grad = None
             total = 0.0
             for c in chunks(len(rows)):
-                prediction = self._standardized(rows[c], None if sorted_skill is None else sorted_skill[c])
+                prediction = self.output(rows[c], None if sorted_skill is None else sorted_skill[c])
                 loss = (prediction - goal[c]).square().sum() / len(rows)
                 loss.backward()
                 total += float(loss.detach())
