@@ -171,7 +171,7 @@ def macro_advantages(batch: Batch, baselines: Baselines, config: MLSHConfig) -> 
         config.manager_baseline, final_obs, batch.time_left[step, env], batch.skill[step, env]
     )
     advantage = segment_gae(
-        steps.reward,
+        steps.scaled_reward,
         value[:-1],
         value[1:].index_put((step, env), final_value),
         steps.terminated,
@@ -265,10 +265,12 @@ def train(config: MLSHConfig, make_envs: MakeEnvs, log: RunLog, seed: int, check
         steps.check(iteration)
         collected = time.perf_counter()
         statistics = policy_statistics(policy, batch)  # of the policy that collected, before its update
+        baselines.scale_rewards(steps, config.gamma)
         estimate = estimate_and_fit(batch, baselines, config)
         trained = ["manager", "skill"] if joint else ["manager"]
         objective = levels(policy, batch, estimate.manager, estimate.skills, trained)
         losses = optimize(config, objective, optimizers, steps.num_steps, seed, iteration)
+        steps.feed(policy.filter)
         check_finite(iteration, parameters=nn.utils.parameters_to_vector(policy.parameters()))
         end = time.perf_counter()
 

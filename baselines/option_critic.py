@@ -20,9 +20,10 @@ from hippo.core.checkpoint import Checkpoint
 from hippo.core.gae import gae
 from hippo.core.log import RunLog, check_finite
 from hippo.core.minibatch import maximize_in_minibatches, minibatches
+from hippo.core.networks import normalize_columns
 from hippo.core.normalize import standardize
 from hippo.core.options import Execution, OptionPolicy, Options
-from hippo.core.policies import gaussian_entropy
+from hippo.core.policies import POLICY_HEAD, gaussian_entropy
 from hippo.core.ppo import Level, Rows, clipped_surrogate, in_chunks, surrogate_statistics
 from hippo.core.rollout import Steps
 from hippo.core.settings import ConfigError, check, setting
@@ -111,6 +112,20 @@ class OptionCriticConfig:
         ours="HiPPO's, so that given skills can be loaded",
         choices=("bilinear", "concatenate"),
     )
+    skill_observation: str = setting(
+        "robot",
+        "what the intra-option policies see: the robot's own observation or everything",
+        code="everything",
+        ours="robot: as HiPPO's skills",
+        choices=("robot", "full"),
+    )
+    initialisation: str = setting(
+        "glorot",
+        "initial weights: Glorot-uniform, or normc (norm one per output, 0.01 in the last layer of a policy)",
+        code="normc",
+        ours="glorot: as all methods",
+        choices=("glorot", "normc"),
+    )
     log_std_per_skill: bool = setting(
         False,
         "one log-std vector per option instead of a shared one",
@@ -158,9 +173,10 @@ class OptionCriticConfig:
 
 def make_policy(config: OptionCriticConfig, envs: Any, generator: torch.Generator) -> OptionPolicy:
     """Freshly drawn networks for these environments."""
-    return OptionPolicy(
-        envs.single_observation_space.shape[0],
-        envs.robot_size,
+    obs_size = envs.single_observation_space.shape[0]
+    policy = OptionPolicy(
+        obs_size,
+        envs.robot_size if config.skill_observation == "robot" else obs_size,
         envs.single_action_space.shape[0],
         config.num_skills,
         config.skill_hidden_sizes,
@@ -172,6 +188,11 @@ def make_policy(config: OptionCriticConfig, envs: Any, generator: torch.Generato
         config.log_std_per_skill,
         config.termination_bias,
     )
+    if config.initialisation == "normc":
+        normalize_columns([policy.skills.first, *policy.skills.rest.layers], POLICY_HEAD, generator)
+        normalize_columns(policy.manager.logits.layers, POLICY_HEAD, generator)
+        normalize_columns(policy.critic.layers, 1.0, generator)
+    return policy
 
 
 def execution(

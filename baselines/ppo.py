@@ -146,7 +146,8 @@ def train(config: PPOConfig, make_envs: MakeEnvs, log: RunLog, seed: int, checkp
             }
 
         if reward_scale is not None:
-            steps.scaled_reward = reward_scale(steps.reward, steps.done, config.gamma)
+            reward_scale.take_in(steps.reward, steps.done, config.gamma)
+            steps.scaled_reward = reward_scale(steps.reward)
         value = baseline.predict(steps.obs)
         final_obs, step, env = steps.final()
         next_value = value[1:].index_put((step, env), baseline.predict(final_obs))
@@ -184,8 +185,7 @@ def train(config: PPOConfig, make_envs: MakeEnvs, log: RunLog, seed: int, checkp
         explained = explained_variance(value[:-1][is_decision], target)
         if not config.values_in_loop:
             baseline.fit(obs, target, config.value_iterations)
-        if policy.filter is not None:
-            policy.filter.update(steps.raw_obs[:-1])
+        steps.feed(policy.filter)
         check_finite(iteration, parameters=nn.utils.parameters_to_vector(policy.parameters()))
         end = time.perf_counter()
 

@@ -42,9 +42,16 @@ ALGORITHMS = {
 }
 BUDGET_FIELDS = ("iterations", "batch_size", "horizon")
 # Filled in from the run level, or descriptions that no override should touch.
-NOT_OVERRIDDEN = {"budget", "off_policy", "seeds", "scale", "env.name", "env.label", "env.seconds_per_step"} | {
-    f"algo.{name}" for name in BUDGET_FIELDS
-}
+NOT_OVERRIDDEN = {
+    "budget",
+    "off_policy",
+    "protocol",
+    "seeds",
+    "scale",
+    "env.name",
+    "env.label",
+    "env.seconds_per_step",
+} | {f"algo.{name}" for name in BUDGET_FIELDS}
 KINDS = ("train", "pretrain", "evaluate", "measure")
 # Bumped when what hippo.gradients.measure, experiments.evaluate or an algorithm's `skills` makes of a run changes.
 KIND_REVISIONS = {"measure": 1, "evaluate": 1}
@@ -85,6 +92,21 @@ class OffPolicyBudget:
 
 
 @dataclass
+class Protocol:
+    """How all on-policy learners are set up: settings, budgets and seeds that differ from the defaults.
+
+    Off-policy HIRO has none of the settings; pre-training is the same under every protocol.
+    """
+
+    name: str = MISSING
+    label: str = MISSING
+    settings: dict[str, Any] = field(default_factory=dict)
+    learners: dict[str, dict[str, Any]] = field(default_factory=dict)
+    budget: dict[str, dict[str, dict[str, int]]] = field(default_factory=dict)  # scale -> environment
+    seeds: dict[str, int] = field(default_factory=dict)  # scale -> seeds of a figure
+
+
+@dataclass
 class WandbConfig:
     """The mirror to Weights & Biases."""
 
@@ -106,6 +128,7 @@ class RunSchema:
     runs_dir: str = MISSING
     budget: dict[str, Budget] = field(default_factory=dict)
     off_policy: OffPolicyBudget = field(default_factory=OffPolicyBudget)
+    protocol: Protocol = field(default_factory=Protocol)
     wandb: WandbConfig = field(default_factory=WandbConfig)
 
 
@@ -125,6 +148,7 @@ class Run:
     seconds_per_step: float
     kind: str = "train"  # or pretrain; evaluate and measure are about the trained run with the same settings
     evaluation: dict[str, Any] | None = None  # of kind evaluate: episodes, perturbations, strengths
+    protocol: str = "paper"
 
     @functools.cached_property
     def parent(self) -> "Run | None":
@@ -190,6 +214,7 @@ class Run:
                 "seed": self.seed,
                 "mujoco": installed("mujoco"),
             }
+            | ({"protocol": self.protocol} if self.protocol != Run.protocol else {})
             | of_the_kind
             | ({"evaluation": self.evaluation} if self.evaluation else {})
         )
@@ -282,11 +307,17 @@ def _register() -> None:
 
 
 @functools.cache
-def _base(env: str, algo: str, scale: str) -> DictConfig:
+def _base(env: str, algo: str, scale: str, protocol: str) -> DictConfig:
     """The composed configuration before any override; Hydra is asked once per combination."""
     _register()
+    chosen = {"env": env, "algo": algo, "scale": scale, "protocol": protocol}
     with initialize_config_dir(str(CONF), version_base="1.3"):
-        return compose("config", overrides=[f"env={env}", f"algo={algo}", f"scale={scale}"])
+        config = compose("config", overrides=[f"{group}={name}" for group, name in chosen.items()])
+    if algo in config.protocol.learners:
+        of_all = {key: value for key, value in config.protocol.settings.items() if key in config.algo}
+        config.algo.merge_with(of_all | dict(config.protocol.learners[algo]))
+        config.budget.merge_with(config.protocol.budget.get(scale, {}))
+    return config
 
 
 def compose_run(overrides: Sequence[str]) -> Run:
@@ -295,7 +326,7 @@ def compose_run(overrides: Sequence[str]) -> Run:
     Raises:
         ConfigError: an unknown group choice or key, a value of the wrong type or out of range.
     """
-    groups = {"env": "block_hopper", "algo": "hippo", "scale": "paper"}
+    groups = {"env": "block_hopper", "algo": "hippo", "scale": "paper", "protocol": "paper"}
     settings = []
     for override in _parse(overrides):
         key = override.key_or_group
@@ -336,7 +367,7 @@ def _apply(config: DictConfig, override: Override) -> None:
 def _keys(node: DictConfig, prefix: str = "") -> Iterator[str]:
     for name in map(str, node):
         key, child = f"{prefix}{name}", node._get_node(name)
-        if isinstance(child, DictConfig) and name not in ("budget", "off_policy"):
+        if isinstance(child, DictConfig) and name not in ("budget", "off_policy", "protocol"):
             yield from _keys(child, f"{key}.")
         elif key not in NOT_OVERRIDDEN:
             yield key
@@ -412,4 +443,5 @@ def _validated(config: DictConfig, algo: str) -> Run:
         plain["wandb"]["project"],
         env["seconds_per_step"],
         kind="pretrain" if algo in PRETRAINING.values() else "train",
+        protocol=plain["protocol"]["name"] if algo in plain["protocol"]["learners"] else Run.protocol,
     )

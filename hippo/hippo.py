@@ -93,8 +93,7 @@ def train(config: HippoConfig, make_envs: MakeEnvs, log: RunLog, seed: int, chec
         losses = improve(config, objective, critics, optimizer, policy.filter, steps.num_steps, seed, iteration)
         if not config.values_in_loop:
             baselines.fit(batch, estimate.returns)
-        if policy.filter is not None:
-            policy.filter.update(steps.raw_obs[:-1])
+        steps.feed(policy.filter)
         check_finite(iteration, parameters=nn.utils.parameters_to_vector(policy.parameters()))
         end = time.perf_counter()
 

@@ -12,7 +12,7 @@ from hippo.core.checkpoint import Checkpoint, load
 from hippo.core.gae import gae
 from hippo.core.minibatch import minibatches
 from hippo.core.normalize import standardize
-from hippo.core.options import ObservationFilter, Options
+from hippo.core.options import Options
 from hippo.core.policies import GaussianPolicy
 from hippo.core.ppo import Level, maximize
 from hippo.core.settings import ConfigError
@@ -506,30 +506,6 @@ def test_an_option_without_steps_in_a_portion_is_no_problem():
         learn(config, policy, data)
         assert moved(policy, before) == set(NETWORKS)
         assert all(bool(torch.isfinite(p).all()) for p in policy.parameters())
-
-
-# --- the observation filter -------------------------------------------------------------------------------------------
-
-
-def test_the_filter_is_exactly_the_identity_until_it_has_seen_something():
-    x = torch.tensor([[1e6, -7.0, 0.3]])
-    observation_filter = ObservationFilter(3)
-    assert torch.equal(observation_filter(x), x)
-    assert np.array_equal(observation_filter.actor()(x.numpy()), x.numpy())
-
-
-def test_the_filter_has_the_mean_and_deviation_of_everything_seen_and_clips_at_five():
-    x = torch.randn(1000, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([1.0, 40.0, 1e-3]) + 7
-    observation_filter = ObservationFilter(3)
-    for part in x.split([10, 700, 290]):
-        observation_filter.update(part.view(5, -1, 3))
-    torch.testing.assert_close(observation_filter.mean, x.double().mean(0))
-    torch.testing.assert_close(observation_filter.variance, x.double().var(0, correction=0))
-    y = observation_filter(x)
-    assert float(y[:, 0].std()) == pytest.approx(1, abs=0.01)
-    assert float(y[:, 2].std()) < 0.02  # a nearly constant entry is not blown up
-    assert float(observation_filter(torch.full((1, 3), 1e5)).max()) == 5
-    torch.testing.assert_close(torch.from_numpy(observation_filter.actor()(x.numpy())), y)
 
 
 # --- given skills -----------------------------------------------------------------------------------------------------

@@ -42,10 +42,12 @@ class Baselines(nn.Module):
             return torch.zeros(time_left.shape, dtype=torch.float64)
         return getattr(self, kind).predict(*self.inputs(kind, obs, time_left, skill))
 
-    def scale_rewards(self, steps: Steps, gamma: float) -> None:
-        """Let the levels learn from scaled rewards, if that is the setting."""
+    def scale_rewards(self, steps: Steps, gamma: float, frozen: bool = False) -> None:
+        """Let the levels learn from scaled rewards, if that is the setting; `frozen`: by the scale as it is."""
         if self.reward_scale is not None:
-            steps.scaled_reward = self.reward_scale(steps.reward, steps.done, gamma)
+            if not frozen:
+                self.reward_scale.take_in(steps.reward, steps.done, gamma)
+            steps.scaled_reward = self.reward_scale(steps.reward)
 
     def critics(self, batch: Batch, returns: dict[str, Tensor]) -> list[Critic]:
         """The baselines in use over the rows that `levels` has, sorted by skill."""

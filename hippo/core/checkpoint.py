@@ -100,10 +100,18 @@ class Checkpoint:
         self.save({"iteration": iteration, **{name: part.state_dict() for name, part in parts.items()}})
 
     def restore(self, **parts: Any) -> int:
-        """Load what `record` saved into `parts`; returns the iteration to go on with, 0 for a fresh start."""
+        """Load what `record` saved into `parts`; returns the iteration to go on with, 0 for a fresh start.
+
+        Raises:
+            CheckpointError: the checkpoint is of other networks or settings than `parts`.
+        """
         state = self.load()
         if state is None:
             return 0
         for name, part in parts.items():
-            part.load_state_dict(state[name])
+            try:
+                part.load_state_dict(state[name])
+            except (KeyError, RuntimeError, ValueError) as error:
+                what = " ".join(str(error).split())[:200]
+                raise CheckpointError(f"{self.current}: not of this run's settings: {name}: {what}") from error
         return state["iteration"] + 1

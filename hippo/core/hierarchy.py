@@ -92,6 +92,9 @@ class HierarchyConfig(OnPolicyConfig):
             raise ConfigError("period_min", self.period_min, f"must be at most period_max={self.period_max}")
         if self.truncate_to_period and self.period_min < self.period_max:
             raise ConfigError("truncate_to_period", True, "needs a fixed period (period_min = period_max)")
+        if self.skills and self.normalize_observations:
+            valid = "is a file of skills that see observations as they are: needs normalize_observations=false"
+            raise ConfigError("skills", self.skills, valid)
 
 
 def with_time(obs: Tensor, time_left: Tensor) -> Tensor:

@@ -106,18 +106,21 @@ class RewardScale(RunningMoments):
     """Divides rewards by the running standard deviation of the discounted sums of past rewards, and clips.
 
     The sums are those of Engstrom et al. (2020), section 3: G_t = r_t + gamma G_{t-1}, from zero at every episode's
-    start. The batch at hand counts, so that the first reward ever seen is not divided by almost nothing.
+    start. Learners take a batch in before they scale it, so that the first reward is not divided by almost nothing.
     """
 
     def __init__(self) -> None:
         super().__init__(1)
 
-    def forward(self, reward: Tensor, done: Tensor, gamma: float) -> Tensor:
-        """Take in rewards and episode ends (T, N) of a batch that starts with fresh episodes; scaled rewards (T, N)."""
+    def take_in(self, reward: Tensor, done: Tensor, gamma: float) -> None:
+        """Know the rewards and episode ends (T, N) of one more batch, which starts with fresh episodes."""
         sums, running = torch.empty_like(reward), torch.zeros_like(reward[0])
         for t in range(len(reward)):
             running = reward[t] + gamma * running
             sums[t] = running
             running = running.masked_fill(done[t], 0.0)
         self.update(sums.unsqueeze(-1))
+
+    def forward(self, reward: Tensor) -> Tensor:
+        """Scaled rewards, in the shape of `reward`."""
         return (reward / (self.variance.sqrt() + EPSILON)).clamp(-REWARD_RANGE, REWARD_RANGE)

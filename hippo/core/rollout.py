@@ -116,6 +116,11 @@ class Steps:
             view = observation_filter.actor()
             self._final = [(t, where, view(obs)) for t, where, obs in self._final]
 
+    def feed(self, observation_filter: ObservationFilter | None) -> None:
+        """Let the filter know the observations of a batch that has been learnt from."""
+        if observation_filter is not None:
+            observation_filter.update(self.raw_obs[:-1])
+
     @property
     def num_steps(self) -> int:
         """Environment steps taken, T N."""
