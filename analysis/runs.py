@@ -20,6 +20,10 @@ class MissingData(RuntimeError):
     """There is nothing to analyse; the message says what to do."""
 
 
+class NotAtThisScale(MissingData):
+    """There never will be anything: the figure is not trained at this scale; the message names those that have it."""
+
+
 @dataclass
 class Results:
     """The runs of one figure."""
@@ -36,12 +40,33 @@ class Results:
         commits = " ".join(commit[:10] or "unknown" for commit in self.commits) or "those of the committed results"
         return f"{len(ids)} runs, set {digest}: {' '.join(ids)}; commits: {commits}"
 
+    def origin(self) -> str:
+        """How many rows and runs are committed results and how many were trained here, in words."""
+        committed = {run["run_id"] for run in self.plan["runs"] if run["state"] == "committed"}
+        of = self.frame["run_id"].isin(committed)
+        parts = {"committed as results": self.frame[of], "trained here": self.frame[~of]}
+        return ", ".join(
+            f"{len(rows):,} rows of {rows['run_id'].nunique()} runs {where}" if len(rows) else f"nothing {where}"
+            for where, rows in parts.items()
+        )
+
     def missing_lines(self) -> list[str]:
-        """`missing` in words, a line per environment, variant and state."""
-        groups: dict[tuple[str, str, str], list[str]] = {}
-        for run in self.missing:
-            groups.setdefault((run["env"], run["variant"], run["state"]), []).append(str(run["seed"]))
-        return [f"{env} {variant} seed {', '.join(seeds)} ({state})" for (env, variant, state), seeds in groups.items()]
+        """`missing` in words: a line per environment, and per seeds and state where these differ."""
+        lines = []
+        for env in dict.fromkeys(run["env"] for run in self.missing):
+            here = [run for run in self.missing if run["env"] == env]
+            states = {run["state"] for run in here}
+            if len(here) == sum(run["env"] == env for run in self.plan["runs"]) and len(states) == 1:
+                lines.append(f"{env}, every run ({states.pop()})")
+                continue
+            seeds: dict[tuple[str, str], list[str]] = {}
+            for run in here:
+                seeds.setdefault((run["variant"], run["state"]), []).append(str(run["seed"]))
+            alike: dict[str, list[str]] = {}
+            for (variant, state), which in seeds.items():
+                alike.setdefault(f"seed {', '.join(which)} ({state})", []).append(variant)
+            lines += [f"{env} {', '.join(variants)} {what}" for what, variants in alike.items()]
+        return lines
 
 
 def load(
@@ -53,18 +78,18 @@ def load(
         metrics: columns of progress.csv to read, None for all.
 
     Raises:
-        MissingData: no plan, or not one row.
+        MissingData: no plan, or not one row. NotAtThisScale: there will never be one.
         ValueError: rows of two scales, or of two kinds of physics for one environment, which must not be drawn
             together; a plan that is no JSON.
     """
     path = runs_dir / "plans" / scale / f"{figure}.json"
     if not path.exists():
-        raise MissingData(f"{figure}: no plan at scale {scale} in {runs_dir}; run `make {figure} SCALE={scale}`")
+        raise MissingData(f"{figure}: no plan at scale {scale} in {runs_dir}; run `make draw-{figure} SCALE={scale}`")
     plan = json.loads(path.read_text())
     if plan["scale"] != scale:
         raise ValueError(f"{path}: is a plan of scale {plan['scale']}, not of {scale}")
     if not plan["runs"]:
-        raise MissingData(f"{figure}: nothing is trained at scale {scale}; choose another")
+        raise NotAtThisScale(f"{figure}: not trained at scale {scale}, only at {', '.join(plan['scales'])}")
     physics = pd.DataFrame(plan["runs"]).groupby("env")["physics"].nunique()
     if (physics > 1).any():
         raise ValueError(f"{figure}: {physics.idxmax()} mixes two kinds of physics")
@@ -88,7 +113,10 @@ def load(
             parts.append(rows.assign(figure=figure, scale=scale, **labels))
     frame = pd.concat(parts, ignore_index=True)[COLUMNS] if parts else pd.DataFrame(columns=COLUMNS)
     if frame.empty:
-        raise MissingData(f"{figure}: none of its {len(plan['runs'])} runs at scale {scale} has a result yet")
+        raise MissingData(
+            f"{figure}: none of its {len(plan['runs'])} runs at scale {scale} has a result yet; "
+            f"`make {figure} SCALE={scale}` trains them"
+        )
     return Results(plan, frame, missing, read_commits(runs_dir, sorted(set(frame["run_id"]))))
 
 

@@ -4,7 +4,8 @@ import argparse
 import sys
 from typing import Any
 
-EXIT_FAILED, EXIT_BAD_INPUT, EXIT_DIVERGED, EXIT_REQUEUE = 1, 2, 3, 75  # 75 is sysexits' EX_TEMPFAIL
+EXIT_FAILED, EXIT_BAD_INPUT, EXIT_DIVERGED, EXIT_NOT_AGREED = 1, 2, 3, 4
+EXIT_REQUEUE = 75  # sysexits' EX_TEMPFAIL
 
 
 class Parser(argparse.ArgumentParser):

@@ -20,6 +20,7 @@ from experiments.train import prepare
 from hippo.core.checkpoint import Checkpoint
 from hippo.core.log import RunLog
 
+REFERENCE = Path(__file__).with_name("reference_costs.json")  # committed; experiments.cost_table --measure writes it
 STEPS, ITERATIONS = 200, 3  # of the short training, per environment; its first iteration warms up and does not count
 
 
@@ -73,6 +74,27 @@ def cost(run: Run, table: dict[str, Any] | None = None) -> Cost:
 def seconds(run: Run, table: dict[str, Any] | None = None) -> float:
     """Core-seconds of a whole run."""
     return run.env_steps * cost(run, table).seconds_per_step
+
+
+def kind(run: Run) -> str:
+    """What the committed cost of a step depends on."""
+    return f"{run.algo} {run.env} {run.options.get('physics', 'paper')}"
+
+
+@functools.cache
+def reference() -> dict[str, Any]:
+    """The committed costs: `cpu`, `day` and `seconds_per_step` by kind of run."""
+    return json.loads(REFERENCE.read_text())
+
+
+def reference_source() -> str:
+    """Where the committed costs were measured, in words."""
+    return f"one core of {reference()['cpu']}, {reference()['day']}"
+
+
+def reference_seconds(run: Run) -> float:
+    """Core-seconds of a whole run by the committed costs: the same on every machine, which decides what is asked for."""
+    return run.env_steps * reference()["seconds_per_step"].get(kind(run), run.seconds_per_step)
 
 
 def disk(run: Run, table: dict[str, Any] | None = None) -> int:

@@ -72,6 +72,7 @@ class Plan:
             "figure": self.figure,
             "scale": self.scale,
             "title": self.description["title"],
+            "scales": trained_at(self.description),
             "not_trained": [{"env": env, "env_label": env_label(env)} for env in left_out],
             "runs": [
                 {
@@ -106,6 +107,12 @@ def load_figure(figure: str) -> dict[str, Any]:
     """conf/figure/<figure>.yaml."""
     check_choice("figure", figure, choices("figure"))
     return yaml.safe_load((CONF / "figure" / f"{figure}.yaml").read_text())
+
+
+def trained_at(description: dict[str, Any]) -> list[str]:
+    """Scales at which a figure trains anything."""
+    left_out = description.get("not_trained", {})
+    return [scale for scale in choices("scale") if set(description["environments"]) - set(left_out.get(scale, []))]
 
 
 def env_label(env: str) -> str:

@@ -289,18 +289,18 @@ def queued(runs_dir: Path) -> dict[str, str]:
     return live
 
 
-def wait(runs: Sequence[Run], runs_dir: Path, report: Callable[[int, int], None]) -> dict[str, str]:
+def wait(runs: Sequence[Run], runs_dir: Path, report: Callable[[Sequence[Run], int], None]) -> dict[str, str]:
     """Watch the run folders until Slurm has nothing more to do with `runs`; the final state of each.
 
     Args:
-        report: called at every look with the number of runs in progress and of those that ended.
+        report: called at every look with the runs in progress and the number of those that ended.
     """
     gone: set[str] = set()
     while True:
         live = queued(runs_dir)
         states = {run.run_id: read_status(run.folder)["state"] for run in runs}
         ended = {i for i, state in states.items() if state in ("finished", "diverged") or i not in live}
-        report(sum(state == "running" for state in states.values()), len(ended))
+        report([run for run in runs if states[run.run_id] == "running"], len(ended))
         if ended <= gone and len(ended) == len(states):  # seen twice: a job between two states is in no list
             return {i: "lost" if state in ("running", "missing") else state for i, state in states.items()}
         gone = ended

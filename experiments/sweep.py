@@ -2,12 +2,14 @@
 
 python -m experiments.sweep plan all --scale paper     what would be trained and what it costs on this machine
 python -m experiments.sweep run fig3 --scale smoke     do it; the same command again continues
+python -m experiments.sweep write all --scale laptop   no more than the plans that drawing reads; trains and measures nothing
 python -m experiments.sweep status fig3 --watch        how every run is doing
 python -m experiments.sweep retry fig3                 once more what the machine, not the code, made fail
 """
 
 import argparse
 import os
+import shutil
 import signal
 import sys
 import time
@@ -15,29 +17,38 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from experiments import costs, slurm
-from experiments.command_line import EXIT_FAILED, EXIT_REQUEUE, Parser, bad_input, clock
+from experiments.command_line import EXIT_FAILED, EXIT_NOT_AGREED, EXIT_REQUEUE, Parser, bad_input, clock
 from experiments.config import Run, check_choice, choices
 from experiments.launchers import run_locally
-from experiments.plan import Plan, make_plan, overview, summary
+from experiments.plan import Plan, make_plan, overview, summary, trained_at
 from experiments.status import DONE, read_status
 from hippo.core.settings import ConfigError
 
 LAUNCHERS = ("local", "slurm")
 REPORT_SECONDS = 10.0  # between two progress lines
+NAMED = 4  # runs in progress that a progress line names
+CORE_HOURS = 2.0  # more than this is not started without being agreed to
 MAX_ATTEMPTS = 3  # of a run that the machine made fail, before `retry` leaves it alone
 
 
-def train_all(todo: Sequence[Run], workers: int, report: Callable[[int, int], None]) -> dict[str, str]:
+Report = Callable[[Sequence[Run], int], None]  # takes the runs in progress and the number of those that ended
+
+
+def train_all(todo: Sequence[Run], workers: int, report: Report) -> dict[str, str]:
     """Train `todo`; runs that another launch is training are waited for, and taken over should it give up.
 
     Args:
-        report: called about once a second with the number of runs in progress and of those that ended.
+        report: called about once a second.
     """
     states: dict[str, str] = {}
     here = list(todo)
     while here:
         before = len(todo) - len(here)
-        states |= run_locally(here, workers, lambda active, ended, before=before: report(len(active), before + ended))  # type: ignore[misc]
+
+        def on_change(active: dict[str, Run], ended: int, before: int = before) -> None:
+            report(list(active.values()), before + ended)
+
+        states |= run_locally(here, workers, on_change)
         elsewhere = [run for run in todo if states[run.run_id] == "running"]
         here = []
         while elsewhere and not here:
@@ -45,11 +56,11 @@ def train_all(todo: Sequence[Run], workers: int, report: Callable[[int, int], No
             states |= {run.run_id: read_status(run.folder)["state"] for run in elsewhere}
             here = [run for run in elsewhere if states[run.run_id] in ("lost", "preempted")]
             elsewhere = [run for run in elsewhere if states[run.run_id] == "running"]
-            report(len(elsewhere), len(todo) - len(elsewhere) - len(here))
+            report(elsewhere, len(todo) - len(elsewhere) - len(here))
     return states
 
 
-TrainAll = Callable[[Sequence[Run], Callable[[int, int], None]], dict[str, str]]
+TrainAll = Callable[[Sequence[Run], Report], dict[str, str]]
 
 
 def run_figure(plan: Plan, todo: Sequence[Run], train: TrainAll, runs_dir: Path) -> int:
@@ -57,6 +68,7 @@ def run_figure(plan: Plan, todo: Sequence[Run], train: TrainAll, runs_dir: Path)
     started, last_report = time.monotonic(), time.monotonic()
     table = costs.known()
     estimate = {run.run_id: costs.seconds(run, table) for run in todo}
+    names = names_of(plan)
     begun = {run.run_id: read_status(run.folder).get("iteration", -1) + 1 for run in todo}
 
     def progress() -> float:
@@ -77,7 +89,7 @@ def run_figure(plan: Plan, todo: Sequence[Run], train: TrainAll, runs_dir: Path)
         stopping = True
         raise KeyboardInterrupt
 
-    def report(running: int, ended: int) -> None:
+    def report(running: Sequence[Run], ended: int) -> None:
         nonlocal last_report
         if stopping:  # an exception raised inside a finaliser is lost; the flag is not
             raise KeyboardInterrupt
@@ -86,8 +98,9 @@ def run_figure(plan: Plan, todo: Sequence[Run], train: TrainAll, runs_dir: Path)
         last_report = time.monotonic()
         elapsed, done = last_report - started, progress()
         eta = clock(elapsed * (sum(estimate.values()) - done) / done) if done > 0 else "unknown"
-        line = f"[{ended}/{len(todo)}] {running} running, elapsed {clock(elapsed)}, ETA {eta}"
-        print(f"\r{line}\x1b[K" if terminal else line, end="" if terminal else "\n", flush=True)
+        line = f"[{ended}/{len(todo)}] {len(running)} running, elapsed {clock(elapsed)}, ETA {eta}{doing(running, names)}"
+        cut = line[: shutil.get_terminal_size().columns - 1]  # a longer line could not be written over
+        print(f"\r{cut}\x1b[K" if terminal else line, end="" if terminal else "\n", flush=True)
 
     before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
@@ -107,9 +120,25 @@ def run_figure(plan: Plan, todo: Sequence[Run], train: TrainAll, runs_dir: Path)
     return name_failures(plan, todo, states)
 
 
+def names_of(plan: Plan) -> dict[str, str]:
+    """What a reader calls the runs of a plan, by id."""
+    return {e.run.run_id: f"{e.run.env} {e.variant} seed {e.run.seed}" for e in plan.entries}
+
+
+def doing(running: Sequence[Run], names: dict[str, str]) -> str:
+    """The runs in progress with their last return, as the end of a progress line; of many only the first few."""
+    words = []
+    for run in running[:NAMED]:
+        last = read_status(run.folder).get("return_mean")
+        name = names.get(run.run_id, f"{run.env} {run.algo} seed {run.seed}")
+        words.append(name if last is None else f"{name} return {last:.3g}")
+    more = [f"{len(running) - NAMED} more"] if len(running) > NAMED else []
+    return ": " + "; ".join([*words, *more]) if words else ""
+
+
 def name_failures(plan: Plan, todo: Sequence[Run], states: dict[str, str]) -> int:
     """A line on stderr for every run that is not done; returns the exit code."""
-    names = {e.run.run_id: f"{e.run.env} {e.variant} seed {e.run.seed}" for e in plan.entries}
+    names = names_of(plan)
     bad = {e.run.run_id: (e.run, e.state) for e in plan.entries if e.state not in DONE}
     bad |= {run.run_id: (run, states[run.run_id]) for run in todo if states.get(run.run_id, "finished") not in DONE}
     for run_id, (run, state) in bad.items():
@@ -165,19 +194,18 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     """The command line."""
     parser = Parser(prog="experiments.sweep", description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("action", choices=tuple(ACTIONS))
-    parser.add_argument("figure", help="a figure or table of conf/figure; `plan` also takes all")
+    parser.add_argument("figure", help="a figure or table of conf/figure; `plan` and `write` also take all")
     parser.add_argument("--scale", default="smoke", help="smoke, laptop or paper")
     parser.add_argument("--launcher", default="local", help=", ".join(LAUNCHERS))
     parser.add_argument("--workers", type=int, default=len(os.sched_getaffinity(0)), help="processes, one thread each")
     parser.add_argument("--profile", type=Path, help="slurm: what jobs ask for (default: conf/slurm/default.yaml)")
-    parser.add_argument("--dry-run", action="store_true", help="slurm: say what would be submitted")
+    parser.add_argument("--dry-run", action="store_true", help="train nothing; slurm: say what would be submitted")
     parser.add_argument("--wait", action="store_true", help="slurm: return when the jobs have ended, not at once")
     parser.add_argument("--runs-dir", type=Path, default=Path("runs"))
     parser.add_argument("--fresh", action="store_true", help="ignore committed results")
     parser.add_argument("--only", action="append", metavar="RUN_ID", help="nothing but this run and what it needs")
-    parser.add_argument("--max-core-hours", type=float, default=100.0, help="refuse to start more than this")
+    parser.add_argument("--max-core-hours", type=float, default=CORE_HOURS, help="start no more than this unasked")
     parser.add_argument("--yes", action="store_true", help="start it all the same")
-    parser.add_argument("--write", action="store_true", help="plan: also write the plans that drawing reads")
     parser.add_argument("--watch", action="store_true", help="status: again and again until nothing runs")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="override in every run")
     return parser.parse_args(arguments)
@@ -203,17 +231,26 @@ def check_options(options: argparse.Namespace) -> None:
     check_choice("launcher", options.launcher, LAUNCHERS)
     if options.workers < 1:
         raise ConfigError("workers", options.workers, "must be at least 1")
+    if not options.max_core_hours >= 0:  # neither negative nor nan, which is above nothing
+        raise ConfigError("max-core-hours", options.max_core_hours, "must be 0 or more")
 
 
 def show_plan(options: argparse.Namespace, plan_of: Callable[[str], Plan]) -> int:
     """`plan`."""
-    figures = choices("figure") if options.figure == "all" else [options.figure]
-    plans = [plan_of(figure) for figure in figures]
-    print(overview(plans, options.workers))
-    if options.write:
-        for plan in plans:
-            plan.write(options.runs_dir)
+    print(overview([plan_of(figure) for figure in named(options)], options.workers))
     return 0
+
+
+def write_plans(options: argparse.Namespace, plan_of: Callable[[str], Plan]) -> int:
+    """`write`."""
+    for plan in [plan_of(figure) for figure in named(options)]:
+        plan.write(options.runs_dir)
+    return 0
+
+
+def named(options: argparse.Namespace) -> list[str]:
+    """The figures and tables that the command line names."""
+    return choices("figure") if options.figure == "all" else [options.figure]
 
 
 def show_status(options: argparse.Namespace, plan_of: Callable[[str], Plan]) -> int:
@@ -229,30 +266,54 @@ def show_status(options: argparse.Namespace, plan_of: Callable[[str], Plan]) -> 
 
 
 def run_or_retry(options: argparse.Namespace, plan_of: Callable[[str], Plan]) -> int:
-    """`run` and `retry`; refuses what costs too much, before anything is written."""
+    """`run` and `retry`; what costs much is started only if it was agreed to, else nothing is written."""
     plan = plan_of(options.figure)
+    if not plan.entries:
+        print(f"{plan.figure}: not trained at scale {plan.scale}, only at {', '.join(trained_at(plan.description))}")
+        return 0
     todo = plan.todo() if options.action == "run" else may_retry(plan)
     profile = slurm.load_profile(options.profile) if options.launcher == "slurm" else None
-    if options.action == "run" and options.scale != "smoke":
+    hours = sum(costs.reference_seconds(run) for run in todo) / 3600
+    if hours >= options.max_core_hours and todo and not options.yes and not options.dry_run:
+        print(ask(plan, len(todo), hours, options), file=sys.stderr)
+        return EXIT_NOT_AGREED
+    if options.action == "run" and options.scale != "smoke" and not options.dry_run:
         costs.calibrate(todo)
-    cost = sum(costs.seconds(run) for run in todo) / 3600
-    if cost > options.max_core_hours and not options.yes and not options.dry_run:
-        valid = f"below the estimate of {cost:,.0f}; raise it or agree with --yes (make ... YES=1)"
-        raise ConfigError("max-core-hours", options.max_core_hours, valid)
     print(summary(plan), flush=True)
-    if profile is None:
-        plan.write(options.runs_dir)
-        return run_figure(plan, todo, lambda runs, report: train_all(runs, options.workers, report), options.runs_dir)
-    slurm.submit(todo, options.runs_dir, profile, options.dry_run)
+    if profile is not None:
+        slurm.submit(todo, options.runs_dir, profile, options.dry_run)
     if options.dry_run:
         return 0
     plan.write(options.runs_dir)
+    if profile is None:
+        return run_figure(plan, todo, lambda runs, report: train_all(runs, options.workers, report), options.runs_dir)
     if not options.wait:
         return 0
     return run_figure(plan, todo, lambda runs, report: slurm.wait(runs, options.runs_dir, report), options.runs_dir)
 
 
-ACTIONS = {"plan": show_plan, "run": run_or_retry, "status": show_status, "retry": run_or_retry}
+def ask(plan: Plan, runs: int, hours: float, options: argparse.Namespace) -> str:
+    """Three lines: which number asks for consent, where it is from, and how to give it.
+
+    The number is that of the committed reference costs, so that the answer is the same on every machine, every time.
+    """
+    target = f"make {plan.figure} SCALE={plan.scale}"
+    return (
+        f"not started: {plan.figure} at scale {plan.scale} has {runs} runs to train, about {hours:,.1f} core-hours; "
+        f"from {options.max_core_hours:g} on (--max-core-hours) you are asked\n"
+        f"  estimate: environment steps times the committed seconds per step ({costs.reference_source()}); "
+        f"make plan-{plan.figure} SCALE={plan.scale} measures this machine\n"
+        f"  to agree: {target} YES=1, or --yes; without training: make draw-{plan.figure} SCALE={plan.scale}"
+    )
+
+
+ACTIONS = {
+    "plan": show_plan,
+    "write": write_plans,
+    "run": run_or_retry,
+    "status": show_status,
+    "retry": run_or_retry,
+}
 
 
 if __name__ == "__main__":

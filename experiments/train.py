@@ -11,6 +11,7 @@ skills.pt of a pre-training run, episodes.csv of an evaluation.
 import contextlib
 import dataclasses
 import json
+import shlex
 import signal
 import sys
 import time
@@ -46,7 +47,7 @@ class Preempted(BaseException):
 def execute(run: Run) -> str:
     """Do `run` to its end; returns its state: finished, running (elsewhere), diverged, failed or preempted."""
     if read_status(run.folder)["state"] == "finished":
-        print(f"{run.run_id} is finished: {run.folder}")
+        print(f"{run.run_id} is finished: {run.folder}\n{what_next(run)}")
         return "finished"
     parent = run.parent
     if parent is not None and not is_there(parent) and (state := _finish_parent(parent)) != "finished":
@@ -59,6 +60,17 @@ def execute(run: Run) -> str:
         status = read_status(run.folder)
         print(f"{run.run_id} is already running (host {status.get('host')}, pid {status.get('pid')})")
         return "running"
+
+
+def what_next(run: Run) -> str:
+    """The last line of a finished run: its folder and the commands that take it."""
+    folder = shlex.quote(str(run.folder))
+    if run.kind != "train":
+        return f"finished: {folder}"
+    return (
+        f"finished: {folder}  evaluate: python -m experiments.evaluate {folder}  video: make video RUN={folder}  "
+        f"compare: python -m paper_figures.compare {folder} OTHER_RUN"
+    )
 
 
 def _finish_parent(parent: Run) -> str:
@@ -85,6 +97,7 @@ def _execute_locked(run: Run) -> str:
         try:
             WORK[run.kind](run, status)
             status.update(state="finished", message="")
+            print(what_next(run), flush=True)
         except Diverged as error:
             checkpoint.save(run.folder / "diverged.pt", error.dump)
             status.end("diverged", str(error))
@@ -160,7 +173,13 @@ def train(run: Run, status: Status) -> None:
             f"return {metrics['return_mean']:.3f}  {speed:,.0f} steps/s  ETA {clock(eta)}",
             flush=True,
         )
-        status.update(iteration=done - 1, env_steps=metrics["env_steps"], steps_per_second=speed, eta=round(eta))
+        status.update(
+            iteration=done - 1,
+            env_steps=metrics["env_steps"],
+            return_mean=float(metrics["return_mean"]),
+            steps_per_second=speed,
+            eta=round(eta),
+        )
 
     algorithm(run.algo).train(with_skills(run), make_envs, RunLog(run.folder, on_row), run.seed, Checkpoint(run.folder))
 

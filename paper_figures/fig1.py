@@ -90,7 +90,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     figure, axes = plt.subplots(figsize=(style.WIDTH, 3.1), layout="constrained")
     draw(axes)
     stem = options.out / options.scale / "fig1"
-    written = style.save(figure, stem, TITLE, "no data: a diagram")
+    written = style.save(figure, style.formats(stem), TITLE, "no data: a diagram")
     caption = stem.with_suffix(".caption.txt")
     caption.write_text(f"{TITLE}. {CAPTION}\n")
     print("wrote", *written, caption)

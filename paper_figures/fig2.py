@@ -66,13 +66,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
         FRAMES.mkdir(parents=True, exist_ok=True)
         for name, picture in pictures.items():
             plt.imsave(FRAMES / f"{name}.png", picture)
-    figure, grid = plt.subplots(1, 4, figsize=(style.WIDTH, 1.6), layout="constrained")
-    for axes, (name, label) in zip(grid, PANELS.items(), strict=True):
-        axes.imshow(pictures[name])
-        axes.set_title(label, fontsize=8)
-        axes.axis("off")
-    stem = options.out / options.scale / "fig2"
-    written = style.save(figure, stem, TITLE, source)
+    stem, written = options.out / options.scale / "fig2", []
+    for shape, size, paths in (
+        ((1, 4), (style.WIDTH, 1.6), style.formats(stem)),
+        ((4, 1), (style.NARROW, 12.0), [style.narrow(stem)]),
+    ):
+        figure, grid = plt.subplots(*shape, figsize=size, layout="constrained")
+        for axes, (name, label) in zip(grid, PANELS.items(), strict=True):
+            axes.imshow(pictures[name])
+            axes.set_title(label, fontsize=8)
+            axes.axis("off")
+        written += style.save(figure, paths, TITLE, source)
+        plt.close(figure)
     caption = stem.with_suffix(".caption.txt")
     caption.write_text(f"{TITLE}. {CAPTION} Frames: {source}.\n")
     print("wrote", *written, caption, f"({source})")

@@ -4,6 +4,7 @@ The second row measures what section 4.2 suggests: the total variance over traje
 at the policy that the random-p run ended with, relative to no baseline.
 """
 
+import functools
 import sys
 
 import numpy as np
@@ -15,18 +16,21 @@ from paper_figures import curves
 KINDS = {"none": "#999999", "single": "#E69F00", "skill": "#0072B2"}
 
 
-def draw_variance(axes: Axes, results: Results, env: str) -> None:
-    """Bars of the mean over seeds, a dot per seed; the skills' gradient variance over that without a baseline."""
+def relative_variance(results: Results, env: str) -> tuple[np.ndarray, str]:
+    """(seeds, kinds) the skills' gradient variance over that without a baseline; or why there is none."""
     chosen = results.frame.query("env == @env and variant == 'gradient_variance'")
+    if chosen.empty:
+        return np.empty((0, len(KINDS))), "not measured"
     table = chosen.pivot_table(index="seed", columns="metric", values="value")
-    table = table[table["variance_none"] > 0] if "variance_none" in table else table
-    if table.empty:
-        reason = "no reward\nin the batch" if len(chosen) else "not measured\nat this scale"
-        axes.text(0.5, 0.5, reason, transform=axes.transAxes, ha="center", va="center")
-        axes.set_axis_off()
-        return
+    table = table[table["variance_none"] > 0]
     columns = [f"variance_{kind}" for kind in KINDS]
-    relative = table[columns].to_numpy() / table[["variance_none"]].to_numpy()  # (seeds, kinds)
+    relative = table[columns].to_numpy() / table[["variance_none"]].to_numpy()
+    return relative, "" if len(table) else "no reward in the batch"
+
+
+def draw_variance(axes: Axes, results: Results, env: str) -> None:
+    """Bars of the mean over seeds, a dot per seed."""
+    relative, _ = relative_variance(results, env)
     axes.bar(list(KINDS), relative.mean(0), color=list(KINDS.values()), width=0.6)
     for row in relative:
         axes.plot(np.arange(len(KINDS)), row, ".", color="black", markersize=3)
@@ -37,11 +41,14 @@ def draw_variance(axes: Axes, results: Results, env: str) -> None:
 
 EXTRA = curves.Extra(
     tuple(f"variance_{kind}" for kind in KINDS),
+    lambda results, env: relative_variance(results, env)[1],
     draw_variance,
     "relative gradient variance",
     "Bottom: total variance over trajectories of the skills' policy gradient at the final policy of the random-p run, "
     "relative to no baseline; baselines fitted on one batch and used on another; bars: mean over seeds, dots: seeds.",
 )
 
+main = functools.partial(curves.main, "fig4", extra=EXTRA)
+
 if __name__ == "__main__":
-    sys.exit(curves.main("fig4", extra=EXTRA))
+    sys.exit(main())

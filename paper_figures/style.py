@@ -1,6 +1,7 @@
 """How every figure looks: colours by method, sizes in inches at the printed scale, byte-stable files."""
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +9,7 @@ import matplotlib as mpl
 from matplotlib.figure import Figure
 
 WIDTH = 7.2  # in; the text width of a page, so that nothing is scaled in print
+NARROW = 3.6  # in; what a phone shows without making letters small
 
 # Okabe and Ito's palette, told apart by readers with any colour vision; a method has one colour in every figure.
 COLORS = {
@@ -71,21 +73,30 @@ def watermark(figure: Figure, text: str) -> None:
     )
 
 
-def save(figure: Figure, stem: Path, title: str, provenance: str) -> list[Path]:
-    """Write `stem`.pdf, .svg and .png; the same figure gives the same bytes.
+def formats(stem: Path) -> list[Path]:
+    """`stem`.pdf, .svg and .png."""
+    return [stem.with_suffix(suffix) for suffix in (".pdf", ".svg", ".png")]
+
+
+def narrow(stem: Path) -> Path:
+    """Where the same picture with its panels below each other goes, for a phone."""
+    return stem.with_name(f"{stem.name}.narrow.png")
+
+
+def save(figure: Figure, paths: Sequence[Path], title: str, provenance: str) -> list[Path]:
+    """Write a figure to `paths`, in the format of each one's suffix; the same figure gives the same bytes.
 
     Args:
         provenance: which runs and which commit stand behind it; goes into the files' metadata.
     """
-    stem.parent.mkdir(parents=True, exist_ok=True)
-    pdf, svg, png = (stem.with_suffix(suffix) for suffix in (".pdf", ".svg", ".png"))
-    information = {"Title": title, "Creator": "hippo-suite", "Keywords": provenance}
-    for path, metadata in (
-        (pdf, information | {"CreationDate": None, "Producer": None}),
-        (svg, {"Title": title, "Creator": "hippo-suite", "Description": provenance, "Date": None}),
-        (png, {"Title": title, "Software": "hippo-suite", "Description": provenance}),
-    ):
+    metadata: dict[str, dict[str, Any]] = {
+        ".pdf": {"Creator": "hippo-suite", "Keywords": provenance, "CreationDate": None, "Producer": None},
+        ".svg": {"Creator": "hippo-suite", "Description": provenance, "Date": None},
+        ".png": {"Software": "hippo-suite", "Description": provenance},
+    }
+    for path in paths:
+        path.parent.mkdir(parents=True, exist_ok=True)
         temporary = path.with_name(f"{path.stem}.tmp{path.suffix}")
-        figure.savefig(temporary, metadata=metadata, dpi=220)
+        figure.savefig(temporary, metadata={"Title": title} | metadata[path.suffix], dpi=220)
         os.replace(temporary, path)
-    return [pdf, svg, png]
+    return list(paths)

@@ -4,6 +4,7 @@ The same estimator for both: the same episodes (object positions, poses, noise) 
 environment. Bold: the best return of a column's cell, as in the paper.
 """
 
+import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,7 +14,7 @@ import pandas as pd
 import yaml
 
 from analysis import stats
-from analysis.runs import MissingData, Results, load
+from analysis.runs import Results
 from paper_figures import command_line, tabular
 
 HERE = Path(__file__).parent
@@ -85,24 +86,19 @@ def printed_row(row: tabular.Row, values: dict[str, Any]) -> tabular.Row:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Write table1.csv, .md and .tex, and print the table."""
-    options = command_line.parse("table1", arguments)
-    try:
-        results = load("table1", options.scale, options.runs_dir, options.data, metrics=None)
-    except (MissingData, ValueError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+    return command_line.make("table1", arguments, None, write)
+
+
+def write(results: Results, options: argparse.Namespace) -> str:
+    """Write the files; returns the table."""
     stem = options.out / options.scale / "table1"
     episodes = results.frame.groupby(["run_id", "metric"]).size().max()
     scale = " It says nothing about the methods." if options.scale == "smoke" else ""
-    note = f"Scale: {options.scale}.{scale} {episodes} stochastic episodes per seed. {NOTE}"
+    note = f"Scale: {options.scale}.{scale} {episodes} stochastic episodes per seed. {NOTE} From {results.origin()}."
     comment = results.provenance()
     text = tabular.write(stem, results.plan["title"], note, rows(results), comment)
     results.frame.to_csv(stem.with_suffix(".csv"), index=False, lineterminator="\n")
-    for what in results.missing_lines():
-        print(f"missing or incomplete: {what}")
-    print(text)
-    print(f"wrote {stem}.csv {stem}.md {stem}.tex")
-    return 0
+    return f"{text}\nwrote {stem}.csv {stem}.md {stem}.tex"
 
 
 if __name__ == "__main__":

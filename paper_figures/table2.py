@@ -4,6 +4,7 @@ Means over seeds of what each seed's batch gives; the standard deviation is over
 does not say what it calls the probability of a continuous action, so every definition is a row.
 """
 
+import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,7 +12,7 @@ from pathlib import Path
 import pandas as pd
 import yaml
 
-from analysis.runs import MissingData, Results, load
+from analysis.runs import Results
 from paper_figures import command_line, tabular
 
 HERE = Path(__file__).parent
@@ -73,22 +74,18 @@ def rows(results: Results) -> list[dict[str, str]]:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Write table2.csv, .md and .tex, and print the table."""
-    options = command_line.parse("table2", arguments)
-    try:
-        results = load("table2", options.scale, options.runs_dir, options.data, metrics=None)
-    except (MissingData, ValueError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+    return command_line.make("table2", arguments, None, write)
+
+
+def write(results: Results, options: argparse.Namespace) -> str:
+    """Write the files; returns the table."""
     table, stem = rows(results), options.out / options.scale / "table2"
-    note = f"Scale: {options.scale}." + (" It says nothing about the methods." if options.scale == "smoke" else "")
+    scale = " It says nothing about the methods." if options.scale == "smoke" else ""
+    note = f"Scale: {options.scale}.{scale} From {results.origin()}."
     comment = results.provenance()
     text = tabular.write(stem, results.plan["title"], note, table, comment)
     results.frame.to_csv(stem.with_suffix(".csv"), index=False, lineterminator="\n")
-    for what in results.missing_lines():
-        print(f"missing or incomplete: {what}")
-    print(text)
-    print(f"wrote {stem}.csv {stem}.md {stem}.tex")
-    return 0
+    return f"{text}\nwrote {stem}.csv {stem}.md {stem}.tex"
 
 
 if __name__ == "__main__":
