@@ -1,5 +1,4 @@
 # The front door. `make help` lists the targets; every target installs what it needs first.
-#   SCALE=smoke|laptop|paper   LAUNCHER=local|slurm [PROFILE=file.yaml]   FRESH=1 (ignore committed results)   YES=1 (agree to large plans)
 
 SHELL := /bin/bash
 .DELETE_ON_ERROR:
@@ -9,12 +8,21 @@ PYTHON ?= python3
 SCALE ?= smoke
 LAUNCHER ?= local
 RUNS_DIR ?= runs
+#= SCALE=smoke|laptop|paper  how much is trained: minutes (default), hours to days, a cluster
+#= LAUNCHER=local|slurm      where: on this machine (default), or as jobs of a Slurm cluster
+#= PROFILE=FILE              slurm: what jobs ask for, a copy of experiments/conf/slurm/default.yaml
+#= WORKERS=N                 local: runs trained at once (default: one per core)
+#= YES=1                     agree to training what takes 2 core-hours or more
+#= FRESH=1                   ignore committed results
+#= RUNS_DIR=FOLDER           where runs are kept (default: runs)
 BIN := .venv/bin
 PY = $(BIN)/python -m
+q = '$(subst ','\'',$(1))'# one word to the shell, whatever it holds
 
-SWEEP_FLAGS = --scale $(SCALE) --launcher $(LAUNCHER) --runs-dir $(RUNS_DIR) $(if $(FRESH),--fresh) $(if $(YES),--yes)
-SWEEP_FLAGS += $(if $(filter slurm,$(LAUNCHER)),--wait) $(if $(PROFILE),--profile $(PROFILE))
-DRAW_FLAGS = --scale $(SCALE) --runs-dir $(RUNS_DIR)
+PLAN_FLAGS = --scale $(call q,$(SCALE)) --runs-dir $(call q,$(RUNS_DIR)) $(if $(FRESH),--fresh)
+SWEEP_FLAGS = $(PLAN_FLAGS) --launcher $(call q,$(LAUNCHER)) $(if $(YES),--yes) $(if $(filter slurm,$(LAUNCHER)),--wait)
+SWEEP_FLAGS += $(if $(PROFILE),--profile $(call q,$(PROFILE))) $(if $(WORKERS),--workers $(call q,$(WORKERS)))
+DRAW_FLAGS = --scale $(call q,$(SCALE)) --runs-dir $(call q,$(RUNS_DIR))
 
 FIGURES := $(filter fig%,$(basename $(notdir $(wildcard paper_figures/fig*.py))))
 TABLES := $(filter table%,$(basename $(notdir $(wildcard paper_figures/table*.py))))
@@ -22,19 +30,35 @@ TABLES := $(filter table%,$(basename $(notdir $(wildcard paper_figures/table*.py
 install: .venv/installed  ## make .venv with the locked versions (nothing to do when nothing changed)
 
 .venv/installed: requirements.lock pyproject.toml
-	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "Python >= 3.11 is needed; set PYTHON=..." >&2; exit 2; }
-	$(PYTHON) -m venv .venv
+	@$(call q,$(PYTHON)) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "Python >= 3.11 is needed; set PYTHON=..." >&2; exit 2; }
+	$(call q,$(PYTHON)) -m venv .venv
 	$(BIN)/pip install --quiet --disable-pip-version-check --requirement requirements.lock
 	$(BIN)/pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
 	@touch $@
 
+planned = $(wildcard experiments/conf/figure/$(1).yaml)# of those that train something
+BAD_INPUT := 2
+
+draw = $(if $(call planned,$(1)),$(PY) experiments.sweep write $(1) $(PLAN_FLAGS) &&) $(PY) paper_figures.draw $(call q,$(1)) $(DRAW_FLAGS)
+
 $(FIGURES) $(TABLES): install
-	@if [ -f experiments/conf/figure/$@.yaml ]; then $(PY) experiments.sweep run $@ $(SWEEP_FLAGS); fi
-	@$(PY) paper_figures.$@ $(DRAW_FLAGS)
+	@$(if $(call planned,$@),$(PY) experiments.sweep run $@ $(SWEEP_FLAGS) || { code=$$?; \
+		[ $$code = $(BAD_INPUT) ] || { $(call draw,$@); }; exit $$code; })
+	@$(PY) paper_figures.draw $@ $(DRAW_FLAGS)
 
-all: $(FIGURES) $(TABLES)  ## every figure and table at SCALE
+all: install  ## every figure and table at SCALE
+	@$(MAKE) --no-print-directory --keep-going $(FIGURES) $(TABLES)
 
-report: install claims  ## one page with everything drawn at SCALE
+draw-%: install
+	@$(call draw,$*)
+
+draw-all: plans  ## draw everything that is there at SCALE; train nothing
+	@$(PY) paper_figures.draw all $(DRAW_FLAGS)
+
+plans: install
+	@$(PY) experiments.sweep write all $(PLAN_FLAGS)
+
+report: draw-all claims  ## one page with everything that is there at SCALE; trains nothing
 	@$(PY) analysis.report $(DRAW_FLAGS)
 
 skills-gallery: install  ## measure and draw the given skills, and a short video of each where OpenGL works
@@ -42,11 +66,11 @@ skills-gallery: install  ## measure and draw the given skills, and a short video
 	@$(PY) paper_figures.gallery
 	@$(PY) experiments.gallery paper_figures/data/skills/*.pt --videos paper_figures/out/gallery || [ $$? -eq 1 ]  # no OpenGL
 
-claims: install  ## the paper's comparative sentences and what the results at SCALE say about them
+claims: plans  ## the paper's comparative sentences and what the results at SCALE say about them
 	@$(PY) analysis.claims $(DRAW_FLAGS)
 
 results: install  ## docs/results.md and its pictures, from the committed results
-	@for scale in laptop paper; do $(PY) experiments.sweep plan all --scale $$scale --runs-dir build/results --write > /dev/null; done
+	@for scale in laptop paper; do $(PY) experiments.sweep write all --scale $$scale --runs-dir build/results; done
 	@for csv in paper_figures/data/*/fig*.csv; do \
 		scale=$$(basename $$(dirname $$csv)); figure=$$(basename $$csv .csv); \
 		$(PY) paper_figures.$$figure --scale $$scale --runs-dir build/results --out build/results/out > /dev/null && \
@@ -55,7 +79,7 @@ results: install  ## docs/results.md and its pictures, from the committed result
 	@$(PY) analysis.results --runs-dir build/results
 
 plan-%: install
-	@$(PY) experiments.sweep plan $* $(SWEEP_FLAGS)
+	@$(PY) experiments.sweep plan $(call q,$*) $(SWEEP_FLAGS)
 
 lint: install  ## ruff (format and rules) and mypy
 	$(BIN)/ruff format --check .
@@ -79,7 +103,7 @@ test-report: install  ## the report in a real browser, Debian's Chromium, instal
 smoke: fig3  ## train and draw Figure 3 at smoke scale
 
 bench: install  ## speeds as ratios within one run, 25 minutes; QUICK=1, ONLY="peers memory", WRITE=1 (docs/performance.md)
-	@$(PY) experiments.bench $(if $(QUICK),--quick) $(if $(ONLY),--only $(ONLY)) $(if $(WRITE),--write)
+	@$(PY) experiments.bench $(if $(QUICK),--quick) $(if $(ONLY),--only $(foreach part,$(ONLY),$(call q,$(part)))) $(if $(WRITE),--write)
 
 profile: install  ## a flame graph of one HiPPO iteration on Ant Gather, docs/pictures/profile_ant_gather.svg
 	@$(PY) experiments.bench_flame
@@ -88,16 +112,19 @@ install-render:  ## what off-screen drawing needs, by apt (as root)
 	apt-get update -qq && apt-get install -y -qq --no-install-recommends libegl1 libgl1-mesa-dri
 
 video: install  ## a video of a trained policy: make video RUN=runs/<run_id>
-	@[ -n "$(RUN)" ] || { echo "error: RUN=: name a run folder, as in make video RUN=runs/<run_id>" >&2; exit 2; }
-	@$(PY) experiments.video $(RUN)
+	@[ -n $(call q,$(RUN)) ] || { echo "error: RUN=: name a run folder, as in make video RUN=runs/<run_id>" >&2; exit 2; }
+	@$(PY) experiments.video $(call q,$(RUN))
 
 clean:  ## remove what was installed and trained here (asks nothing)
 	rm -rf .venv runs paper_figures/out build *.egg-info
 
 help:  ## this list
-	@awk -F ':.*## ' '/^[a-z%-]+:.*## / {printf "  make %-12s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
-	@echo "  make figN        train what is missing and draw: $(FIGURES)"
-	@echo "  make tableN      the same for: $(or $(TABLES),none yet)"
-	@echo "  make plan-figN   what it would train and cost, without training"
+	@awk -F ':.*## ' '/^[a-z%-]+:.*## / {printf "  make %-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+	@echo "  make figN           train what is missing, asking from 2 core-hours on, and draw: $(FIGURES)"
+	@echo "  make tableN         the same for: $(TABLES)"
+	@echo "  make draw-figN      draw what is there, committed or trained here, and name what is missing; train nothing"
+	@echo "  make plan-figN      what it would train and cost, without training"
+	@echo "variables, as in make fig3 SCALE=laptop:"
+	@sed -n 's/^#= /  /p' $(MAKEFILE_LIST)
 
-.PHONY: install install-render all report skills-gallery claims results lint test test-slow test-slurm test-report smoke bench profile video clean help $(FIGURES) $(TABLES)
+.PHONY: install install-render all draw-all plans report skills-gallery claims results lint test test-slow test-slurm test-report smoke bench profile video clean help $(FIGURES) $(TABLES)

@@ -65,6 +65,8 @@ class Artefact:
     title: str
     picture: Path | None
     size: tuple[int, int]  # of the picture, in pixels
+    narrow: Path | None  # the same with its panels below each other, for a phone
+    narrow_size: tuple[int, int]
     caption: list[str]
     table: Table | None
     files: list[str]  # what lies beside the page
@@ -217,13 +219,21 @@ def read_runs(plans: dict[str, dict[str, Any]], runs_dir: Path) -> list[RunFacts
 
 
 def absent(plan: dict[str, Any], states: dict[str, str]) -> list[str]:
-    """Planned runs that are not there, a line per environment, method and state."""
-    groups: dict[tuple[str, str, str], list[str]] = {}
+    """Planned runs that are not there: a line per environment, seeds and state, with the methods."""
+    seeds: dict[tuple[str, str, str], list[str]] = {}
+    methods: dict[str, set[str]] = {}  # planned in an environment
     for run in plan["runs"]:
+        env, label = str(run.get("env_label", "")), str(run.get("variant_label", ""))
+        methods.setdefault(env, set()).add(label)
         if (state := states[str(run["run_id"])]) not in THERE:
-            key = (str(run.get("env_label", "")), str(run.get("variant_label", "")), state)
-            groups.setdefault(key, []).append(str(run.get("seed", "")))
-    return [f"{env}, {label}, seed {', '.join(seeds)}: {state}" for (env, label, state), seeds in groups.items()]
+            seeds.setdefault((env, label, state), []).append(str(run.get("seed", "")))
+    alike: dict[tuple[str, str], list[str]] = {}
+    for (env, label, state), which in seeds.items():
+        alike.setdefault((env, f"seed {', '.join(which)}: {state}"), []).append(label)
+    return [
+        f"{env}, {'every method' if len(labels) == len(methods[env]) > 1 else '; '.join(labels)}, {what}"
+        for (env, what), labels in alike.items()
+    ]
 
 
 def read_artefact(name: str, folder: Path, plan: dict[str, Any] | None, states: dict[str, str]) -> Artefact:
@@ -232,9 +242,11 @@ def read_artefact(name: str, folder: Path, plan: dict[str, Any] | None, states: 
     Raises:
         ValueError: its picture is none, or its table has rows of different lengths.
     """
-    picture, caption, table = (folder / f"{name}{suffix}" for suffix in (".png", ".caption.txt", ".md"))
+    picture, narrow, caption, table = (
+        folder / f"{name}{suffix}" for suffix in (".png", ".narrow.png", ".caption.txt", ".md")
+    )
     files = sorted(path for path in folder.glob(f"{name}.*") if path.suffix in (*STATING, ".csv", ".md"))
-    title, size, lines, cells = name, (0, 0), [], None
+    title, lines, cells = name, [], None
     if table.exists():
         text = table.read_text()
         try:
@@ -243,12 +255,8 @@ def read_artefact(name: str, folder: Path, plan: dict[str, Any] | None, states: 
             raise ValueError(f"{table}: {error}") from error
         lines = [line for line in text.splitlines() if line and not line.startswith("|")]
         title = lines[0].split(". ")[0] if lines else name
-    if picture.exists():
-        try:
-            with Image.open(picture) as image:
-                size, title = image.size, str(image.info.get("Title", title)).removeprefix(f"{name}: ")
-        except OSError as error:
-            raise ValueError(f"{picture}: is no picture ({error}); draw it again") from error
+    size, named = read_picture(picture)
+    title = named.removeprefix(f"{name}: ") or title
     if caption.exists():
         lines = [line for line in caption.read_text().splitlines() if line]
     plan = plan or {"title": title, "runs": []}
@@ -264,6 +272,8 @@ def read_artefact(name: str, folder: Path, plan: dict[str, Any] | None, states: 
         title=str(plan["title"]),
         picture=picture if picture.exists() else None,
         size=size,
+        narrow=narrow if narrow.exists() else None,
+        narrow_size=read_picture(narrow)[0],
         caption=lines,
         table=cells,
         files=[path.name for path in files],
@@ -275,23 +285,46 @@ def read_artefact(name: str, folder: Path, plan: dict[str, Any] | None, states: 
     )
 
 
+def read_picture(path: Path) -> tuple[tuple[int, int], str]:
+    """Size in pixels and title, both empty without the file.
+
+    Raises:
+        ValueError: it is no picture.
+    """
+    if not path.exists():
+        return (0, 0), ""
+    try:
+        with Image.open(path) as image:
+            return image.size, str(image.info.get("Title", ""))
+    except OSError as error:
+        raise ValueError(f"{path}: is no picture ({error}); draw it again") from error
+
+
 def drawn_names(folder: Path) -> list[str]:
     """Figures and tables in a scale's folder, in the paper's order."""
-    names = {path.stem for path in (*folder.glob("*.png"), *folder.glob("*.md"))} - set(OWN_FILES)
+    names = {path.name.partition(".")[0] for path in (*folder.glob("*.png"), *folder.glob("*.md"))} - set(OWN_FILES)
     return sorted(names, key=natural)
 
 
-def not_drawn(scale: str, drawn: Iterable[str], plans: dict[str, dict[str, Any]]) -> list[str]:
-    """A line per figure and table of the suite, or of a plan, that is not on the page."""
+def not_drawn(scale: str, drawn: Iterable[str], plans: dict[str, dict[str, Any]], states: dict[str, str]) -> list[str]:
+    """A line per figure and table of the suite, or of a plan, that is not on the page, and what to type for it."""
     scripts = (ROOT / "paper_figures").glob("*.py")
     suite = {path.stem for path in scripts if re.fullmatch(r"(fig|table)\d+", path.stem)}
     lines = []
     for name in sorted((suite | set(plans)) - set(drawn), key=natural):
         if name in plans and not plans[name]["runs"]:
-            lines.append(f"{name}: nothing is trained for it at scale {scale}")
+            others = " or ".join(f"make {name} SCALE={other}" for other in plans[name].get("scales", []))
+            lines.append(f"{name}: not trained at scale {scale}" + (f"; {others}" if others else ""))
+        elif name in plans and not any(drawable(run, states) for run in plans[name]["runs"]):
+            lines.append(f"{name}: nothing to draw yet; make {name} SCALE={scale} trains it")
         else:
-            lines.append(f"{name}: not drawn; make {name} SCALE={scale}")
+            lines.append(f"{name}: not drawn; make draw-{name} SCALE={scale}")
     return lines
+
+
+def drawable(run: dict[str, Any], states: dict[str, str]) -> bool:
+    """Whether a planned run can be drawn: its figure's own rows are committed, or its folder is finished."""
+    return run.get("state") == "committed" or states[str(run["run_id"])] == "finished"
 
 
 def origin(plans: dict[str, dict[str, Any]], states: dict[str, str]) -> Table:
@@ -342,7 +375,7 @@ def gather(scale: str, runs_dir: Path, data: Path, out: Path) -> Report:
         known = ", ".join(scales(runs_dir, out)) or "none"
         raise MissingData(
             f"scale={scale}: nothing was drawn or planned (scales that have something: {known}); "
-            f"run `make all SCALE={scale}`"
+            f"run `make draw-all SCALE={scale}`"
         )
     runs = read_runs(plans, runs_dir)
     states = {run.run_id: run.state for run in runs}
@@ -351,7 +384,7 @@ def gather(scale: str, runs_dir: Path, data: Path, out: Path) -> Report:
     return Report(
         scale=scale,
         artefacts=[read_artefact(name, folder, plans.get(name), states) for name in names],
-        not_drawn=not_drawn(scale, names, plans),
+        not_drawn=not_drawn(scale, names, plans, states),
         runs=runs,
         origin=origin(plans, states),
         committed_files=committed_files(scale, data),

@@ -41,7 +41,11 @@ def table(plans: dict[tuple[str, str], Plan]) -> str:
     lines.append(f"| `make all` | every run once | {' | '.join(map(_cell, together))} |")
     source = costs.reference_source()
     return "\n".join(
-        [*lines, "", f"Core-hours on {source}. `make plan-fig3 SCALE=paper` measures yours and says what is left to do."]
+        [
+            *lines,
+            "",
+            f"Core-hours on {source}. `make plan-fig3 SCALE=paper` measures yours and says what is left to do.",
+        ]
     )
 
 

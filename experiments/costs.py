@@ -93,7 +93,7 @@ def reference_source() -> str:
 
 
 def reference_seconds(run: Run) -> float:
-    """Core-seconds of a whole run by the committed costs: the same on every machine, which decides what is asked for."""
+    """Core-seconds of a whole run by the committed costs, which are the same on every machine."""
     return run.env_steps * reference()["seconds_per_step"].get(kind(run), run.seconds_per_step)
 
 

@@ -2,7 +2,7 @@
 
 python -m experiments.sweep plan all --scale paper     what would be trained and what it costs on this machine
 python -m experiments.sweep run fig3 --scale smoke     do it; the same command again continues
-python -m experiments.sweep write all --scale laptop   no more than the plans that drawing reads; trains and measures nothing
+python -m experiments.sweep write all --scale laptop   only the plans that drawing reads; train and measure nothing
 python -m experiments.sweep status fig3 --watch        how every run is doing
 python -m experiments.sweep retry fig3                 once more what the machine, not the code, made fail
 """
@@ -98,7 +98,9 @@ def run_figure(plan: Plan, todo: Sequence[Run], train: TrainAll, runs_dir: Path)
         last_report = time.monotonic()
         elapsed, done = last_report - started, progress()
         eta = clock(elapsed * (sum(estimate.values()) - done) / done) if done > 0 else "unknown"
-        line = f"[{ended}/{len(todo)}] {len(running)} running, elapsed {clock(elapsed)}, ETA {eta}{doing(running, names)}"
+        line = (
+            f"[{ended}/{len(todo)}] {len(running)} running, elapsed {clock(elapsed)}, ETA {eta}{doing(running, names)}"
+        )
         cut = line[: shutil.get_terminal_size().columns - 1]  # a longer line could not be written over
         print(f"\r{cut}\x1b[K" if terminal else line, end="" if terminal else "\n", flush=True)
 
@@ -270,6 +272,7 @@ def run_or_retry(options: argparse.Namespace, plan_of: Callable[[str], Plan]) ->
     plan = plan_of(options.figure)
     if not plan.entries:
         print(f"{plan.figure}: not trained at scale {plan.scale}, only at {', '.join(trained_at(plan.description))}")
+        plan.write(options.runs_dir)
         return 0
     todo = plan.todo() if options.action == "run" else may_retry(plan)
     profile = slurm.load_profile(options.profile) if options.launcher == "slurm" else None

@@ -136,8 +136,8 @@ def how_smoothed(results: Results, share: float) -> str:
         return "not smoothed"
     points = ", ".join(f"{window} of {n}" for n, window in windows.items() if window > 1)
     return (
-        f"each seed's curve smoothed, before anything else, by a centred moving mean over {share:.0%} of the iterations "
-        f"({points}), of which less is there at both ends; the csv file beside this is not"
+        f"each seed's curve smoothed before anything else by a centred moving mean over {share:.0%} of its iterations "
+        f"({points}; at the ends over what is there), the csv file beside this is not"
     )
 
 

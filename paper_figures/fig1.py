@@ -21,6 +21,7 @@ MANAGER, SKILL, STATE = "#0072B2", "#D55E00", "#F2F2F2"
 TOP, MIDDLE, BOTTOM = 3.0, 1.5, 0.0  # rows: manager, skill, environment
 COLUMNS = (0.0, 1.7, 4.3, 6.8, 8.5)  # s_kp, s_kp+1, the end of the commitment, the next decision, after it
 DOTS, LABELS = 3.0, -2.3  # where columns are left out; where the rows' names begin
+HALVES = ((LABELS, 4.93), (3.2, 10.43))  # of the narrow picture; the second takes up the first's last column
 
 
 def box(axes: Axes, x: float, y: float, text: str, face: str, ink: str = "white") -> None:
@@ -45,8 +46,8 @@ def arrow(axes: Axes, start: tuple[float, float], end: tuple[float, float], **ho
     axes.add_patch(FancyArrowPatch(start, end, **look))
 
 
-def draw(axes: Axes) -> None:
-    """One commitment of p steps and the beginning of the next."""
+def draw(axes: Axes, left: float = LABELS, right: float = COLUMNS[-1] + 0.8) -> None:
+    """One commitment of p steps and the beginning of the next, from `left` to `right`."""
     states = ["$s_{kp}$", "$s_{kp+1}$", "$s_{(k+1)p-1}$", "$s_{(k+1)p}$", "$s_{(k+1)p+1}$"]
     actions = ["$a_{kp}$", "$a_{kp+1}$", "$a_{(k+1)p-1}$", "$a_{(k+1)p}$", ""]
     for i, (x, state, action) in enumerate(zip(COLUMNS, states, actions, strict=True)):
@@ -77,7 +78,9 @@ def draw(axes: Axes) -> None:
     axes.text((COLUMNS[0] + COLUMNS[2]) / 2, -0.98, "time commitment: $p$ steps", ha="center", va="center", fontsize=8)
     for y, role in ((TOP, "manager"), (MIDDLE, "sub-policy\n(skill)"), (BOTTOM, "environment")):
         axes.text(LABELS, y, role, ha="left", va="center", fontsize=8, color="#555555")
-    axes.set_xlim(LABELS, COLUMNS[-1] + 0.8)
+    axes.set_xlim(left, right)
+    for text in axes.texts:
+        text.set_clip_on(True)
     axes.set_ylim(-1.2, TOP + 0.5)
     axes.set_aspect("equal")
     axes.axis("off")
@@ -91,6 +94,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     draw(axes)
     stem = options.out / options.scale / "fig1"
     written = style.save(figure, style.formats(stem), TITLE, "no data: a diagram")
+    figure, rows = plt.subplots(2, 1, figsize=(style.NARROW, 5.2), layout="constrained")
+    for axes, half in zip(rows, HALVES, strict=True):
+        draw(axes, *half)
+    written += style.save(figure, [style.narrow(stem)], TITLE, "no data: a diagram")
+    plt.close("all")
     caption = stem.with_suffix(".caption.txt")
     caption.write_text(f"{TITLE}. {CAPTION}\n")
     print("wrote", *written, caption)

@@ -154,7 +154,10 @@ def draw(robot: str, tables: dict[str, pd.DataFrame], out: Path) -> list[Path]:
 
     stem = out / "gallery" / robot
     written = style.save(
-        figure, stem, f"Skills of the {LABELS[robot]}", f"1 runs, set {about['run_id']}: {about['run_id']}"
+        figure,
+        style.formats(stem),
+        f"Skills of the {LABELS[robot]}",
+        f"1 runs, set {about['run_id']}: {about['run_id']}",
     )
     plt.close(figure)
     caption = stem.with_suffix(".caption.txt")

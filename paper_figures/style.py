@@ -52,11 +52,12 @@ RC: dict[str, Any] = {
 
 
 def color_of(variant: str, variants: list[str]) -> str:
-    """The colour of a method; one without a colour of its own takes a spare one by its place."""
+    """The colour of a method; one without a colour of its own takes, by its place, one that is not taken."""
     if variant in COLORS:
         return COLORS[variant]
     others = [v for v in variants if v not in COLORS]
-    return SPARE_COLORS[others.index(variant) % len(SPARE_COLORS)]
+    free = [*SPARE_COLORS, *(color for method, color in COLORS.items() if method not in variants)]
+    return free[others.index(variant) % len(free)]
 
 
 def use() -> None:

@@ -188,7 +188,7 @@ def test_two_scales_are_never_drawn_together(tmp_path):
 
 
 def test_nothing_to_show_is_an_error_that_says_what_to_do(tmp_path):
-    with pytest.raises(runs.MissingData, match="make fig3 SCALE=smoke"):
+    with pytest.raises(runs.MissingData, match="make draw-fig3 SCALE=smoke"):
         runs.load("fig3", "smoke", tmp_path, tmp_path)
     planned(tmp_path, [None, 0])
     with pytest.raises(runs.MissingData, match="none of its 2 runs"):

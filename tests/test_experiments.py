@@ -125,7 +125,8 @@ def test_a_wrong_configuration_is_refused_in_one_line_and_nothing_is_written(ove
         (["run", "fig3", "--launcher", "slrum"], "launcher=slrum"),
         (["run", "fig3", "--workers", "0"], "workers=0"),
         (["run", "fig3", "--set", "algo.gama=1"], "algo.gama=1"),
-        (["run", "fig3", "--scale", "paper"], "max-core-hours=100.0"),
+        (["run", "fig3", "--max-core-hours", "nan"], "max-core-hours=nan"),
+        (["run", "fig3", "--max-core-hours", "-1"], "max-core-hours=-1.0"),
         (["fly", "fig3"], "fly"),
         (["run"], "figure"),
     ],
@@ -382,13 +383,34 @@ def test_a_stop_whose_exception_was_lost_is_heard_at_the_next_report(number, tmp
         with contextlib.suppress(KeyboardInterrupt):  # as Python does when a finaliser raises
             os.kill(os.getpid(), number)
         for _ in range(3):
-            report(0, 0)
+            report([], 0)
         return {}
 
     plan = Plan("fig3", "smoke", {}, fresh=True, entries=[])
     assert sweep.run_figure(plan, [], train, tmp_path) == 75
     assert "the same command continues" in capsys.readouterr().err
     assert signal.getsignal(number) is handler
+
+
+def test_a_progress_line_names_the_runs_in_progress_with_their_last_return(tiny_figure, tmp_path, monkeypatch, capsys):
+    plan = make_plan("tiny", "smoke", tiny_figure[3::2], False, tmp_path)
+    runs = plan.todo()
+    for run, last in zip(runs[:2], ({"return_mean": 1.25}, {}), strict=True):
+        run.folder.mkdir(parents=True)
+        status = {"state": "running", "heartbeat": time.time(), "iteration": 0, "pid": 1} | last
+        (run.folder / "status.json").write_text(json.dumps(status))
+    monkeypatch.setattr(sweep, "REPORT_SECONDS", 0.0)
+
+    def train(_todo, report):
+        report(runs[:2], 2)
+        return dict.fromkeys((run.run_id for run in runs), "finished")
+
+    assert sweep.run_figure(plan, runs, train, tmp_path) == 0
+    line = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("[2/4]"))
+    assert line.endswith(": block_hopper hippo seed 0 return 1.25; block_hopper hippo seed 1")
+    assert "2 running" in line
+    assert sweep.doing(runs * 2, {}).endswith("; 4 more")
+    assert sweep.doing([], {}) == ""
 
 
 def test_every_committed_row_belongs_to_a_run_that_its_plan_still_yields():

@@ -166,18 +166,58 @@ def test_an_id_with_a_path_in_it_reads_no_folder_elsewhere(tmp_path):
 
 
 def test_what_is_missing_is_named(tmp_path, capsys):
-    artefacts.plan(tmp_path, "fig8", [])
+    artefacts.plan(tmp_path, "fig8", [], scales=("laptop", "paper"))
+    artefacts.plan(tmp_path, "fig4", [artefacts.planned(RUNS[0], 0, "missing")])
+    artefacts.plan(tmp_path, "fig5", [artefacts.planned(RUNS[1], 0, "committed")])
     artefacts.picture(tmp_path / "out/smoke/fig10.png", "fig10: later")
     artefacts.picture(tmp_path / "out/smoke/fig3.png", "fig3: A title")
     html, markdown = pages(tmp_path)
     said = capsys.readouterr().out
-    assert "missing: fig1: not drawn; make fig1 SCALE=smoke\n" in said
-    assert "missing: fig8: nothing is trained for it at scale smoke\n" in said
+    assert "missing: fig1: not drawn; make draw-fig1 SCALE=smoke\n" in said
+    assert "missing: fig4: nothing to draw yet; make fig4 SCALE=smoke trains it\n" in said
+    assert "missing: fig5: not drawn; make draw-fig5 SCALE=smoke\n" in said
     assert "fig3: not drawn" not in said
-    assert "fig8: nothing is trained for it at scale smoke" in html
-    assert "- fig8: nothing is trained for it at scale smoke" in markdown
+    nowhere = "fig8: not trained at scale smoke; make fig8 SCALE=laptop or make fig8 SCALE=paper"
+    assert f"missing: {nowhere}\n" in said
+    assert nowhere in html
+    assert f"- {nowhere}" in markdown
     assert [a.name for a in facts(tmp_path).artefacts] == ["fig3", "fig10"]
     assert sorted(["table1", "fig10", "gallery", "fig2"], key=natural) == ["fig2", "fig10", "table1", "gallery"]
+
+
+def test_where_nothing_was_trained_the_page_says_so_instead_of_a_cost_of_nothing(tmp_path):
+    artefacts.plan(tmp_path, "fig3", [artefacts.planned(RUNS[0], 0, "committed")])
+    artefacts.picture(tmp_path / "out/smoke/fig3.png", "fig3: A title", RUNS[:1])
+    for page in pages(tmp_path):
+        assert "nothing was trained here" in page
+        assert "runs timed" not in page
+    artefacts.folder(tmp_path, RUNS[0])
+    for page in pages(tmp_path):
+        assert "nothing was trained here" not in page
+        assert "1 of 1 runs timed" in page
+
+
+def test_a_phone_gets_the_picture_whose_panels_stack(tmp_path):
+    artefacts.picture(tmp_path / "out/smoke/fig3.png", "fig3: A title", RUNS)
+    artefacts.picture(tmp_path / "out/smoke/fig3.narrow.png", "fig3: A title", RUNS, (400, 900))
+    artefacts.picture(tmp_path / "out/smoke/fig1.png", "fig1: A diagram")
+    html, _ = pages(tmp_path)
+    assert [a.name for a in facts(tmp_path).artefacts] == ["fig1", "fig3"]
+    ((size, _),) = re.findall(r'<source media="\(max-width: 34rem\)".*? (width="\d+" height="\d+")>(\s*)<img', html)
+    assert size == 'width="400" height="900"'
+
+
+def test_methods_that_are_missing_alike_share_a_line(tmp_path):
+    runs = [
+        artefacts.planned(f"{i:012x}", seed, "missing", label)
+        for i, (label, seed) in enumerate((label, seed) for label in ("A", "B", "C") for seed in (0, 1))
+    ]
+    artefacts.picture(tmp_path / "out/smoke/fig3.png", "fig3: A title")
+    artefacts.plan(tmp_path, "fig3", runs)
+    assert facts(tmp_path).artefacts[0].absent == ["Ant Gather, every method, seed 0, 1: missing"]
+    runs[0]["state"] = runs[1]["state"] = "committed"
+    artefacts.plan(tmp_path, "fig3", runs)
+    assert facts(tmp_path).artefacts[0].absent == ["Ant Gather, B; C, seed 0, 1: missing"]
 
 
 def test_an_artefact_of_other_runs_says_so(tmp_path):
@@ -222,7 +262,7 @@ def test_with_nothing_to_report_there_is_one_line_and_exit_code_2(tmp_path, caps
     said = capsys.readouterr()
     assert said.err.count("\n") == 1
     assert "scale=smoke" in said.err
-    assert "make all SCALE=smoke" in said.err
+    assert "make draw-all SCALE=smoke" in said.err
     assert said.out == ""
     assert not (tmp_path / "out").exists()
     artefacts.claims(tmp_path)  # claims alone, without a run or a picture, are no report

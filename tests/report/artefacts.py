@@ -30,11 +30,19 @@ def planned(run_id: str, seed: int, state: str = "finished", label: str = "HiPPO
     return {"run_id": run_id, "seed": seed} | labels | rest
 
 
-def plan(root: Path, figure: str, runs: list[dict], title: str = "A title", claims: tuple[str, ...] = ()) -> None:
+def plan(
+    root: Path,
+    figure: str,
+    runs: list[dict],
+    title: str = "A title",
+    claims: tuple[str, ...] = (),
+    scales: tuple[str, ...] = ("smoke",),
+) -> None:
     """A plan as a sweep writes it."""
     path = root / "runs/plans/smoke" / f"{figure}.json"
     path.parent.mkdir(parents=True, exist_ok=True)
     content = {"figure": figure, "scale": "smoke", "title": title, "runs": runs, "claims": list(claims), "notes": []}
+    content["scales"] = list(scales)
     path.write_text(json.dumps(content))
 
 
