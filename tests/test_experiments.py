@@ -353,6 +353,7 @@ def test_ctrl_c_leaves_every_run_resumable_and_no_orphan(tmp_path):
             str(tmp_path),
             "--set",
             "iterations=500",
+            "--yes",
         ],
         cwd=ROOT,
         stdout=subprocess.DEVNULL,
