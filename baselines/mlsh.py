@@ -218,9 +218,8 @@ def optimize(
             size = config.manager_minibatch_size
             parts = len(level.advantage) // size if size else 1
         generator = seeding.torch_generator(seed, f"{level.name} minibatches", iteration)
-        own = dataclasses.replace(level, at=None)  # a minibatch of the master holds decisions, not steps
-        step = (optimizers[level.name], config.updates, parts, config.clip_range, num_steps, generator)
-        new = maximize_in_minibatches([own], *step)
+        optimizer = optimizers[level.name]
+        new = maximize_in_minibatches(level, optimizer, config.updates, parts, config.clip_range, num_steps, generator)
         losses |= new | {"surrogate": losses["surrogate"] + new["surrogate"]}
     return losses
 

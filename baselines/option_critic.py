@@ -349,7 +349,7 @@ def improve(
 
     level = Level("skill", log_prob, data.advantage)
     parts = rows // size if size else 1
-    maximize_in_minibatches([level], optimizers["skill"], epochs, parts, clip_range, rows, generator)
+    maximize_in_minibatches(level, optimizers["skill"], epochs, parts, clip_range, rows, generator)
 
     def critic_loss(i: Tensor) -> Tensor:
         return (of_option(policy.critic(data.seen[i]), data.option[i]) - data.returns[i]).square().mean()

@@ -16,9 +16,9 @@ from torch import Tensor, nn
 
 from hippo.core import seeding
 from hippo.core.checkpoint import Checkpoint
+from hippo.core.direct import Gaussian, SquaredError, network_of
 from hippo.core.gae import segment_gae
 from hippo.core.log import RunLog, check_finite
-from hippo.core.minibatch import Critic
 from hippo.core.normalize import RewardScale, actor_of, standardize
 from hippo.core.on_policy import SurrogateConfig, improve, make_optimizer
 from hippo.core.policies import GaussianPolicy, gaussian_entropy
@@ -171,16 +171,13 @@ def train(config: PPOConfig, make_envs: MakeEnvs, log: RunLog, seed: int, checkp
         def log_prob(c: Rows, obs: Tensor = obs, action: Tensor = action) -> Tensor:
             return policy.log_prob(obs[c], action[c])
 
-        def predicted(c: Rows, obs: Tensor = obs) -> Tensor:
-            return baseline.output(obs[c])
+        def direct(obs: Tensor = obs, action: Tensor = action) -> Gaussian:
+            return Gaussian(network_of(policy.mean.layers), policy.log_std_parameter, obs, None, action)
 
-        level = Level(
-            "policy",
-            log_prob,
-            standardize(advantage).to(obs.dtype),
-            entropy=lambda _: gaussian_entropy(policy.log_std),
-        )
-        critics = [Critic(predicted, target.to(obs.dtype))] if config.values_in_loop else []
+        level = Level("policy", log_prob, standardize(advantage).to(obs.dtype), direct)
+        critics = []
+        if config.values_in_loop:
+            critics = [SquaredError(network_of(baseline.layers, nn.ReLU), obs, None, target.to(obs.dtype))]
         losses = improve(config, [level], critics, optimizer, policy.filter, len(obs), seed, iteration)
         explained = explained_variance(value[:-1][is_decision], target)
         if not config.values_in_loop:

@@ -66,6 +66,7 @@ def test_the_masters_advantages_are_the_published_codes_on_the_fact_sheets_examp
     steps = SimpleNamespace(
         obs=torch.zeros(5, 1, 2),
         reward=reward,
+        scaled_reward=reward,
         terminated=end,
         done=end,
         final=lambda: (torch.zeros(0, 2), nothing, nothing),
@@ -272,7 +273,7 @@ def test_a_minibatch_step_follows_the_mean_surrogate_of_its_rows():
     x, advantage = torch.randn(12, dtype=torch.float64), torch.randn(12, dtype=torch.float64)
     level = Level("manager", lambda c: theta * x[c], advantage)
     optimizer = torch.optim.SGD([theta], lr=1e-3)
-    maximize_in_minibatches([level], optimizer, 1, 3, 0.2, 12, torch.Generator().manual_seed(0))
+    maximize_in_minibatches(level, optimizer, 1, 3, 0.2, 12, torch.Generator().manual_seed(0))
     expected = 0.0
     for rows in minibatches(12, 3, 1, torch.Generator().manual_seed(0)):
         ratio = (expected * x[rows]).exp()

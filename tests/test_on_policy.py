@@ -11,14 +11,15 @@ from baselines import ppo
 from experiments.config import compose_run
 from experiments.evaluate import main as evaluate_main
 from hippo import hippo
+from hippo.core import seeding
 from hippo.core.advantages import Baselines, advantages
 from hippo.core.checkpoint import Checkpoint, CheckpointError, load, save
 from hippo.core.hierarchy import HierarchicalPolicy, collect, levels, restored_policy, rows_by_skill
-from hippo.core.minibatch import Critic, maximize_in_minibatches, minibatches
+from hippo.core.minibatch import minibatches
 from hippo.core.networks import SkillLinear, mlp, normalize_columns
 from hippo.core.normalize import ObservationFilter, RewardScale, RunningMoments
 from hippo.core.on_policy import improve, make_optimizer
-from hippo.core.ppo import Level
+from hippo.core.policies import gaussian_entropy
 from hippo.core.settings import ConfigError
 from tests.test_training import MODERN
 from tests.toy import TargetEnv, progress, run
@@ -152,52 +153,69 @@ def test_a_skill_layer_lets_a_norm_of_one_through_for_every_skill():
 # --- minibatches ------------------------------------------------------------------------------------------------------
 
 
-def test_minibatch_steps_of_two_levels_and_a_value_equal_torchs_own_autograd_and_adam_in_float64():
-    """Two levels, one of which acts in some rows only, and a critic, against a plain loop with torch's own parts."""
+def test_minibatch_steps_equal_torchs_own_autograd_and_adam_in_float64():
+    """Both levels and both baselines of a hierarchy, against a plain loop over what `levels` defines by autograd."""
+    config = hippo_config(updates=2, entropy_weight=0.01, max_gradient_norm=0.3)
 
     def make():
-        torch.manual_seed(3)
-        return [nn.Linear(4, 1).double() for _ in range(3)]  # manager, skill, value
+        generator = torch.Generator().manual_seed(0)
+        policy = HierarchicalPolicy(config, 2, 2, 2, generator)
+        baselines = Baselines(config, 2, generator, in_loop=True)
+        batch = collect(policy, TargetEnv(20, 0, death_rate=0.02), config, 0, 0)
+        baselines.scale_rewards(batch.steps, config.gamma)
+        estimate = advantages(batch, baselines, config)
+        policy.double(), baselines.double()
+        batch.steps.obs, batch.steps.action, batch.time_left = (
+            x.double() for x in (batch.steps.obs, batch.steps.action, batch.time_left)
+        )
+        parameters = [*policy.parameters(), *baselines.parameters()]
+        return policy, baselines, batch, estimate, parameters
 
-    generator = torch.Generator().manual_seed(1)
-    x = torch.randn(60, 4, generator=generator, dtype=torch.float64)
-    where = torch.rand(60, generator=generator) < 0.3
-    at = torch.where(where, where.cumsum(0) - 1, -1)
-    advantage, target = torch.randn(2, 60, generator=generator, dtype=torch.float64)
+    policy, baselines, batch, estimate, ours = make()
+    objective = levels(policy, batch, estimate.manager, estimate.skills)
+    critics = baselines.critics(batch, estimate.returns)
+    improve(config, objective, critics, make_optimizer(config, ours), None, 400, 0, 0)
 
-    ours = make()
-    manager = Level("manager", lambda c: ours[0](x[where][c]).squeeze(-1), advantage[where], at=at)
-    skill = Level("skill", lambda c: ours[1](x[c]).squeeze(-1), advantage, lambda c: ours[1](x[c]).square().mean())
-    parameters = [p for net in ours for p in net.parameters()]
-    optimizer = torch.optim.Adam(parameters, lr=1e-2)
-    order = torch.Generator().manual_seed(5)
-    critics = [Critic(lambda c: ours[2](x[c]).squeeze(-1), target)]
-    maximize_in_minibatches([manager, skill], optimizer, 4, 6, 0.2, 60, order, critics, 0.5, 0.01, 0.3)
-
-    def plain(epochs=4, clip=0.2, norm=0.3):
-        nets = make()
-        parameters = [p for net in nets for p in net.parameters()]
-        adam = torch.optim.Adam(parameters, lr=1e-2)
+    def plain(epochs=2, clip=0.2, norm=0.3, entropy=0.01):
+        policy, baselines, batch, estimate, parameters = make()
+        manager, skill = levels(policy, batch, estimate.manager, estimate.skills)
+        rows_of = rows_by_skill(batch)
+        obs, time_left, active = (
+            x[:-1].flatten(0, 1)[rows_of] for x in (batch.steps.obs, batch.time_left, batch.skill)
+        )
+        where = batch.is_decision[:-1].flatten()
+        seen = policy.manager_input(batch.steps.obs[:-1].flatten(0, 1), batch.time_left[:-1].flatten())[where]
+        adam = torch.optim.Adam(parameters, lr=config.learning_rate, eps=1e-5)
         with torch.no_grad():
-            old = [nets[0](x).squeeze(-1).clone(), nets[1](x).squeeze(-1).clone()]
-        for rows in minibatches(60, 6, epochs, torch.Generator().manual_seed(5)):
-            loss = 0.5 * (nets[2](x[rows]).squeeze(-1) - target[rows]).square().mean()
-            for net, before, own in ((nets[0], old[0], rows[where[rows]]), (nets[1], old[1], rows)):
-                if len(own):
-                    ratio = (net(x[own]).squeeze(-1) - before[own]).exp()
-                    gain = torch.min(ratio * advantage[own], ratio.clamp(1 - clip, 1 + clip) * advantage[own])
-                    loss = loss - gain.mean()
-            loss = loss - 0.01 * nets[1](x[rows]).squeeze(-1).square().mean()
+            old = [level.log_prob(slice(None)) for level in (manager, skill)]
+        generator = seeding.torch_generator(0, "minibatches", 0)
+        for rows in minibatches(400, 8, epochs, generator):
+            decided = manager.at[rows][manager.at[rows] >= 0]
+            loss = -entropy * gaussian_entropy(policy.skills.log_std()[0])
+            log_probs = policy.manager.log_probs(seen[decided])
+            loss = loss + entropy * (log_probs.exp() * log_probs).sum(-1).mean()
+            for level, before, own in ((manager, old[0], decided), (skill, old[1], rows)):
+                ratio = (level.log_prob(own) - before[own]).exp()
+                loss = (
+                    loss
+                    - torch.min(
+                        ratio * level.advantage[own], ratio.clamp(1 - clip, 1 + clip) * level.advantage[own]
+                    ).mean()
+                )
+            for kind, target in estimate.returns.items():
+                x = baselines.inputs(kind, obs[rows], time_left[rows], active[rows])
+                error = getattr(baselines, kind).output(*x) - target.flatten()[rows_of][rows]
+                loss = loss + 0.5 * error.square().mean()
             adam.zero_grad()
             loss.backward()
             nn.utils.clip_grad_norm_(parameters, norm)
             adam.step()
         return parameters
 
-    for mine, theirs in zip(parameters, plain(), strict=True):
-        torch.testing.assert_close(mine, theirs, rtol=1e-10, atol=1e-12)
-    for wrong in ({"epochs": 3}, {"clip": 0.1}, {"norm": 10.0}):
-        assert any(not torch.allclose(a, b, rtol=1e-6) for a, b in zip(parameters, plain(**wrong), strict=True))
+    for mine, theirs in zip(ours, plain(), strict=True):
+        torch.testing.assert_close(mine, theirs, rtol=1e-7, atol=1e-9)
+    for wrong in ({"epochs": 1}, {"clip": 0.1}, {"norm": 10.0}, {"entropy": 0.0}):
+        assert any(not torch.allclose(a, b, rtol=1e-4) for a, b in zip(ours, plain(**wrong), strict=True))
 
 
 def test_a_minibatch_holds_the_steps_of_the_skills_and_the_decisions_made_in_them():
@@ -226,21 +244,19 @@ def test_values_trained_in_the_loop_are_never_fitted_and_predict_what_the_optimi
     baselines.scale_rewards(batch.steps, config.gamma)
     estimate = advantages(batch, baselines, config)
     objective = levels(policy, batch, estimate.manager, estimate.skills)
-    critics = baselines.critics(batch, estimate.returns)
 
-    def error():
-        with torch.no_grad():
-            return [float((c.value(slice(None)) - c.target).square().mean()) for c in critics]
+    def errors():
+        columns = [x[:-1] for x in (batch.steps.obs, batch.time_left, batch.skill)]
+        return [
+            float((baselines.predict(kind, *columns) - target).square().mean())
+            for kind, target in estimate.returns.items()
+        ]
 
-    first = error()
-    improve(config, objective, critics, optimizer, None, 400, 0, 0)
-    assert all(now < then for now, then in zip(error(), first, strict=True))
-    assert torch.equal(baselines.state_dict()["skill.inputs.mean"], before["skill.inputs.mean"])
-    rows = rows_by_skill(batch)
-    obs, time_left, skill = (x[:-1].flatten(0, 1)[rows] for x in (batch.steps.obs, batch.time_left, batch.skill))
-    predicted = baselines.predict("skill", obs, time_left, skill)
-    kinds = list(estimate.returns)
-    torch.testing.assert_close(predicted.float(), critics[kinds.index("skill")].value(slice(None)).detach())
+    first = errors()
+    improve(config, objective, baselines.critics(batch, estimate.returns), optimizer, None, 400, 0, 0)
+    assert all(now < 0.9 * then for now, then in zip(errors(), first, strict=True))
+    for name in ("single.inputs.mean", "skill.inputs.mean", "skill.target.scale"):
+        assert torch.equal(baselines.state_dict()[name], before[name])
 
 
 # --- bad input --------------------------------------------------------------------------------------------------------

@@ -1,16 +1,14 @@
 """Advantages of both levels and the baselines they come from (paper section 4.2, Lemma 2)."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor, nn
 
+from hippo.core.direct import SquaredError, network_of
 from hippo.core.gae import gae, segment_gae
 from hippo.core.hierarchy import Batch, HierarchyConfig, rows_by_skill, with_time
-from hippo.core.minibatch import Critic
 from hippo.core.normalize import RewardScale, standardize
-from hippo.core.ppo import Rows
 from hippo.core.rollout import Steps
 from hippo.core.value import ValueFunction, explained_variance
 
@@ -49,19 +47,14 @@ class Baselines(nn.Module):
                 self.reward_scale.take_in(steps.reward, steps.done, gamma)
             steps.scaled_reward = self.reward_scale(steps.reward)
 
-    def critics(self, batch: Batch, returns: dict[str, Tensor]) -> list[Critic]:
+    def critics(self, batch: Batch, returns: dict[str, Tensor]) -> list[SquaredError]:
         """The baselines in use over the rows that `levels` has, sorted by skill."""
         rows = rows_by_skill(batch)
+        seen = [x[:-1].flatten(0, 1)[rows] for x in (batch.steps.obs, batch.time_left, batch.skill)]
         result = []
         for kind, target in returns.items():
-            columns = (batch.steps.obs, batch.time_left, batch.skill)
-            x, skill = self.inputs(kind, *(c[:-1].flatten(0, 1)[rows] for c in columns))
-            value = getattr(self, kind).output
-
-            def output(c: Rows, x: Tensor = x, skill: Tensor | None = skill, value: Any = value) -> Tensor:
-                return value(x[c], None if skill is None else skill[c])
-
-            result.append(Critic(output, target.flatten()[rows].to(x.dtype)))
+            network = network_of(getattr(self, kind).layers, nn.ReLU)
+            result.append(SquaredError(network, *self.inputs(kind, *seen), target.flatten()[rows].to(seen[0].dtype)))
         return result
 
     def fit(self, batch: Batch, returns: dict[str, Tensor]) -> None:

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 
 from hippo.core import seeding
 from hippo.core.checkpoint import Checkpoint
+from hippo.core.direct import Categorical, Gaussian, network_of
 from hippo.core.networks import normalize_columns
 from hippo.core.normalize import ObservationFilter, actor_of
 from hippo.core.on_policy import OnPolicyConfig
@@ -320,12 +321,11 @@ def levels(
         def manager_log_prob(c: Rows) -> Tensor:
             return policy.manager.log_probs(manager_input[c]).gather(-1, choice[c]).squeeze(-1)
 
-        def manager_entropy(c: Rows) -> Tensor:
-            log_probs = policy.manager.log_probs(manager_input[c])
-            return -(log_probs.exp() * log_probs).sum(-1).mean()
+        def manager_direct() -> Categorical:
+            return Categorical(network_of(policy.manager.logits.layers), manager_input, choice.squeeze(-1))
 
         advantage = manager_advantage.flatten()[where].to(obs.dtype)
-        result.append(Level("manager", manager_log_prob, advantage, manager_entropy, decision))
+        result.append(Level("manager", manager_log_prob, advantage, manager_direct, decision))
     if "skill" in trained:
         skill_input, active = policy.skill_input(obs[rows], time_left[rows]), skill[rows]
         action = batch.steps.action.flatten(0, 1)[rows]
@@ -333,11 +333,12 @@ def levels(
         def skill_log_prob(c: Rows) -> Tensor:
             return policy.skills.log_prob(skill_input[c], active[c], action[c])
 
-        def skill_entropy(c: Rows) -> Tensor:
-            return gaussian_entropy(policy.skills.log_std())[active[c]].mean()
+        def skill_direct() -> Gaussian:
+            network = network_of([policy.skills.first, *policy.skills.rest.layers])
+            return Gaussian(network, policy.skills.log_std_parameter, skill_input, active, action)
 
         advantage = skill_advantage.flatten()[rows].to(obs.dtype)
-        result.append(Level("skill", skill_log_prob, advantage, skill_entropy))
+        result.append(Level("skill", skill_log_prob, advantage, skill_direct))
     return result
 
 

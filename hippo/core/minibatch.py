@@ -1,20 +1,11 @@
-"""Passes over a batch in shuffled minibatches, as in a PPO of today and in the published code of the competitors."""
+"""Passes over a batch in shuffled minibatches, as the published code of the competitors takes them."""
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from hippo.core.ppo import Level, Rows, clipped_surrogate, in_chunks, maximize, surrogate_statistics
-
-
-@dataclass
-class Critic:
-    """A value function's share of a minibatch: what it says of rows, and what they turned out to be worth."""
-
-    value: Callable[[Rows], Tensor]
-    target: Tensor  # (B,)
+from hippo.core.ppo import Level, clipped_surrogate, in_chunks, maximize, surrogate_statistics
 
 
 def minibatches(rows: int, parts: int, epochs: int, generator: torch.Generator) -> Iterator[Tensor]:
@@ -28,63 +19,41 @@ def minibatches(rows: int, parts: int, epochs: int, generator: torch.Generator) 
 
 
 def maximize_in_minibatches(
-    levels: Sequence[Level],
+    level: Level,
     optimizer: torch.optim.Optimizer,
     epochs: int,
     parts: int,
     clip_range: float,
     num_steps: int,
     generator: torch.Generator,
-    critics: Sequence[Critic] = (),
-    value_loss_weight: float = 0.5,
-    entropy_weight: float = 0.0,
-    max_gradient_norm: float = 0.0,
 ) -> dict[str, float]:
-    """Ascend the clipped surrogates in `parts` minibatches per pass; each step is on the sum of its levels' means.
+    """Ascend the clipped surrogate of one level in `parts` minibatches per pass, each step on its minibatch's mean.
 
-    A minibatch is a set of rows that all levels and critics share: a level whose rows are fewer (`Level.at`) takes part
-    with those that lie in it. One part without critics is hippo.core.ppo.maximize: full-batch steps on the sum over
-    `num_steps`.
-
-    Args:
-        critics: value functions that descend their mean squared error over the same rows, times `value_loss_weight`.
-        entropy_weight: of the mean entropy of every level. max_gradient_norm: of all parameters together; 0: any.
+    One part is hippo.core.ppo.maximize: full-batch steps on the sum over `num_steps`.
 
     Returns:
-        Per level `<name>_approx_kl` and `<name>_clip_fraction`; and `surrogate`: means over the last pass.
+        `<name>_approx_kl`, `<name>_clip_fraction` and `surrogate`, means over the last pass.
     """
-    if parts <= 1 and not critics:
-        return maximize(levels, optimizer, epochs, clip_range, num_steps)
-    size = len(levels[0].advantage if levels[0].at is None else levels[0].at)
-    parts = max(1, min(parts, size))
-    old = [in_chunks(level.log_prob, len(level.advantage)) for level in levels]
-    parameters = [p for group in optimizer.param_groups for p in group["params"]]
+    if parts <= 1:
+        return maximize([level], optimizer, epochs, clip_range, num_steps)
+
+    size = len(level.advantage)
+    parts = min(parts, size)
+    old = in_chunks(level.log_prob, size)
     # Sums of the last pass, as tensors: reading a number out of one at every step would cost as much as the step.
-    sums = torch.zeros(len(levels), 3)  # KL, clipped and surrogate of every level
+    kl, clipped, surrogate = torch.zeros(3)
     for step, rows in enumerate(minibatches(size, parts, epochs, generator)):
-        loss = torch.zeros(())
-        for i, (level, before) in enumerate(zip(levels, old, strict=True)):
-            own = rows if level.at is None else level.at[rows]
-            own = own if level.at is None else own[own >= 0]
-            if not len(own):
-                continue
-            log_prob = level.log_prob(own)
-            objective = clipped_surrogate(log_prob, before[own], level.advantage[own], clip_range).mean()
-            loss = loss - objective
-            if entropy_weight and level.entropy is not None:
-                loss = loss - entropy_weight * level.entropy(own)
-            if step >= parts * (epochs - 1):
-                statistics = (*surrogate_statistics(log_prob, before[own], clip_range), objective.detach() * len(own))
-                sums[i] += torch.stack(statistics)
-        for critic in critics:
-            loss = loss + value_loss_weight * (critic.value(rows) - critic.target[rows]).square().mean()
+        log_prob = level.log_prob(rows)
+        objective = clipped_surrogate(log_prob, old[rows], level.advantage[rows], clip_range).mean()
         optimizer.zero_grad(set_to_none=True)
-        loss.backward()
-        if max_gradient_norm:
-            nn.utils.clip_grad_norm_(parameters, max_gradient_norm)
+        (-objective).backward()
         optimizer.step()
-    means = sums / torch.tensor([[len(level.advantage)] for level in levels])
-    metrics: dict[str, float] = {}
-    for level, (kl, clipped, _) in zip(levels, means.tolist(), strict=True):
-        metrics |= {f"{level.name}_approx_kl": kl, f"{level.name}_clip_fraction": clipped}
-    return metrics | {"surrogate": float(means[:, 2].sum())}
+        if step >= parts * (epochs - 1):
+            kl_sum, clipped_sum = surrogate_statistics(log_prob, old[rows], clip_range)
+            kl, clipped = kl + kl_sum, clipped + clipped_sum
+            surrogate = surrogate + objective.detach() * len(rows)
+    return {
+        f"{level.name}_approx_kl": float(kl / size),
+        f"{level.name}_clip_fraction": float(clipped / size),
+        "surrogate": float(surrogate / size),
+    }

@@ -80,7 +80,7 @@ def _through_activation(gradient: np.ndarray, y: np.ndarray, is_tanh: bool) -> N
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _forward(
+def forward_layers(
     blocks: np.ndarray,
     x: np.ndarray,
     first: np.ndarray,
@@ -112,7 +112,7 @@ def _forward(
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _backward(
+def backward_layers(
     blocks: np.ndarray,
     first: np.ndarray,
     weights: Arrays,
@@ -124,7 +124,8 @@ def _backward(
     """Fill the gradients with respect to x W^T + b of all layers but the last, which is given, and `to_x` if not empty.
 
     Args:
-        to_products: L + 1 of (B, outputs), the given one at the end. to_x: (B, D) or (0, D). The others as `_forward`.
+        to_products: L + 1 of (B, outputs), the given one at the end. to_x: (B, D) or (0, D).
+        The others are those of `forward_layers`.
     """
     for group, start, stop in blocks:
         for layer in range(len(kept) - 1, -1, -1):
@@ -163,7 +164,7 @@ class _Layers(torch.autograd.Function):
         ctx.blocks, ctx.counts = _blocks(counts, max(w.shape[1] for w in weights)), counts
         ctx.is_tanh = activation is nn.Tanh
         layers = (x.numpy(), first.numpy(), first_bias.numpy(), _numpy(weights), _numpy(biases))
-        _forward(ctx.blocks, *layers, ctx.is_tanh, _numpy(kept), out.numpy())
+        forward_layers(ctx.blocks, *layers, ctx.is_tanh, _numpy(kept), out.numpy())
         ctx.save_for_backward(x, first, *weights, *kept)
         return out
 
@@ -174,7 +175,7 @@ class _Layers(torch.autograd.Function):
         to_x = torch.empty_like(x) if ctx.needs_input_grad[0] else x[:0]
         to_products = [*(torch.empty_like(y) for y in kept), gradients[0].contiguous()]  # with respect to x W^T + b
         layers = (first.numpy(), _numpy(weights), ctx.is_tanh, _numpy(kept))
-        _backward(ctx.blocks, *layers, _numpy(to_products), to_x.numpy())
+        backward_layers(ctx.blocks, *layers, _numpy(to_products), to_x.numpy())
         # Sums over all rows are torch's: MKL is faster where the first factor is transposed.
         to_first, to_first_bias = torch.empty_like(first), first.new_empty(first.shape[:2])
         groups = zip(to_products[0].split(ctx.counts), x.split(ctx.counts), strict=True)

@@ -9,13 +9,15 @@ import dataclasses
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import nn
 
 from hippo.core import seeding
-from hippo.core.minibatch import Critic, maximize_in_minibatches
+from hippo.core.direct import SquaredError
+from hippo.core.minibatch import minibatches
 from hippo.core.normalize import ObservationFilter
-from hippo.core.ppo import Level, maximize
+from hippo.core.ppo import Level, in_chunks, maximize
 from hippo.core.settings import ConfigError, check, setting
 
 ADAM_EPSILON = 1e-5  # of the minibatches' Adam (OpenAI Baselines)
@@ -122,7 +124,7 @@ def make_optimizer(config: SurrogateConfig, parameters: Iterable[nn.Parameter]) 
 def improve(
     config: SurrogateConfig,
     levels: Sequence[Level],
-    critics: Sequence[Critic],
+    critics: Sequence[SquaredError],
     optimizer: torch.optim.Optimizer,
     observation_filter: ObservationFilter | None,
     num_steps: int,
@@ -138,16 +140,47 @@ def improve(
     passes = 0 if observation_filter is not None and not observation_filter.count else config.updates
     if not config.minibatch_size:
         return maximize(levels, optimizer, passes, config.clip_range, num_steps)
-    return maximize_in_minibatches(
-        levels,
-        optimizer,
-        passes,
-        num_steps // config.minibatch_size,
-        config.clip_range,
-        num_steps,
-        seeding.torch_generator(seed, "minibatches", iteration),
-        critics,
-        config.value_loss_weight,
-        config.entropy_weight,
-        config.max_gradient_norm,
-    )
+    generator = seeding.torch_generator(seed, "minibatches", iteration)
+    return _in_minibatches(config, levels, critics, optimizer, num_steps, passes, generator)
+
+
+def _in_minibatches(
+    config: SurrogateConfig,
+    levels: Sequence[Level],
+    critics: Sequence[SquaredError],
+    optimizer: torch.optim.Optimizer,
+    num_steps: int,
+    passes: int,
+    generator: torch.Generator,
+) -> dict[str, float]:
+    """`improve` in minibatches: sets of steps that levels and critics share, each learning from the mean over its rows.
+
+    A level whose rows are fewer (`Level.at`) takes part with those that lie in the minibatch. The metrics are means
+    over the last pass.
+    """
+    parts = max(1, num_steps // config.minibatch_size)
+    parameters = [p for group in optimizer.param_groups for p in group["params"]]
+    shares = [level.direct() for level in levels if level.direct is not None]
+    old = [in_chunks(level.log_prob, len(level.advantage)).numpy() for level in levels]
+    advantage = [level.advantage.numpy() for level in levels]
+    at = [None if level.at is None else level.at.numpy() for level in levels]
+    sums = np.zeros((len(levels), 3))  # of the last pass: KL, clipped, surrogate
+    for step, minibatch in enumerate(minibatches(num_steps, parts, passes, generator)):
+        rows = minibatch.numpy()
+        for i, share in enumerate(shares):
+            own = rows if at[i] is None else at[i][rows]  # type: ignore[index]
+            own = own[own >= 0]
+            terms = share.ascend(own, old[i][own], advantage[i][own], config.clip_range, config.entropy_weight)
+            if step >= parts * (passes - 1):
+                sums[i] += terms
+        for critic in critics:
+            critic.descend(rows, config.value_loss_weight)
+        if config.max_gradient_norm:
+            nn.utils.clip_grad_norm_(parameters, config.max_gradient_norm)
+        optimizer.step()
+    metrics: dict[str, float] = {}
+    for level, (kl, clipped, _) in zip(levels, sums, strict=True):
+        size = len(level.advantage)
+        metrics |= {f"{level.name}_approx_kl": kl / size, f"{level.name}_clip_fraction": clipped / size}
+    surrogate = sum(total / len(level.advantage) for level, total in zip(levels, sums[:, 2], strict=True))
+    return metrics | {"surrogate": float(surrogate)}

@@ -44,7 +44,7 @@ class _GroupedGaussian(torch.autograd.Function):
             action.contiguous(),
             mean.new_empty(len(mean)),
         )
-        _log_densities(mean.numpy(), log_std.numpy(), action.numpy(), np.array(counts), out.numpy())
+        log_densities(mean.numpy(), log_std.numpy(), action.numpy(), np.array(counts), out.numpy())
         ctx.save_for_backward(mean, log_std, action)
         ctx.counts = np.array(counts)
         return out
@@ -54,12 +54,12 @@ class _GroupedGaussian(torch.autograd.Function):
         mean, log_std, action = (t.numpy() for t in ctx.saved_tensors)
         to_mean, to_log_std = np.empty_like(mean), np.zeros(log_std.shape)
         gradient = gradients[0].contiguous().numpy()
-        _through_log_densities(gradient, mean, log_std, action, ctx.counts, to_mean, to_log_std)
+        through_log_densities(gradient, mean, log_std, action, ctx.counts, to_mean, to_log_std)
         return torch.from_numpy(to_mean), torch.from_numpy(to_log_std.astype(log_std.dtype)), None, None
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _log_densities(
+def log_densities(
     mean: np.ndarray, log_std: np.ndarray, action: np.ndarray, counts: np.ndarray, out: np.ndarray
 ) -> None:
     """Write log N(action; mean, std) to out (B,): mean and action (B, A), log_std (Z, A), counts (Z,)."""
@@ -76,7 +76,7 @@ def _log_densities(
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _through_log_densities(
+def through_log_densities(
     gradient: np.ndarray,
     mean: np.ndarray,
     log_std: np.ndarray,

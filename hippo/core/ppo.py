@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -43,7 +44,7 @@ class Level:
     name: str  # prefix of the metrics
     log_prob: Callable[[Rows], Tensor]  # rows -> log-probability under the current parameters
     advantage: Tensor  # (B,)
-    entropy: Callable[[Rows], Tensor] | None = None  # rows -> mean entropy there, for learners that reward it
+    direct: Callable[[], Any] | None = None  # makes the same for small minibatches (hippo/core/direct.py)
     at: Tensor | None = None  # which of its rows belongs to every row of a minibatch, -1 for none; None: the same
 
 

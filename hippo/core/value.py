@@ -50,10 +50,15 @@ class ValueFunction(nn.Module):
         after_first = mlp([*hidden_sizes, 1], generator, nn.ReLU)
         self.rest, self._layers = nn.Sequential(nn.ReLU(), after_first), after_first.layers
         if initialisation == "normc":
-            normalize_columns([self.first, *self._layers], 1.0, generator)
+            normalize_columns(self.layers, 1.0, generator)
         self.inputs, self.target = Standardizer(input_size), Standardizer(1)
         self.is_fitted: Tensor
         self.register_buffer("is_fitted", torch.tensor(in_loop))
+
+    @property
+    def layers(self) -> "list[nn.Linear | SkillLinear]":
+        """The layers in order; between them are rectifiers."""
+        return [self.first, *self._layers]
 
     def output(self, x: Tensor, skill: Tensor | None = None) -> Tensor:
         """Values of rows sorted by skill, in the units of what the network is trained on: (B, D), (B,) -> (B,)."""
