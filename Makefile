@@ -102,7 +102,7 @@ test-report: install  ## the report in a real browser, Debian's Chromium, instal
 
 smoke: fig3  ## train and draw Figure 3 at smoke scale
 
-bench: install  ## speeds as ratios within one run, 25 minutes; QUICK=1, ONLY="peers memory", WRITE=1 (docs/performance.md)
+bench: install  ## speeds as ratios within one run, 25 minutes; QUICK=1, ONLY="peers memory" or "learning", WRITE=1 (docs/performance.md)
 	@$(PY) experiments.bench $(if $(QUICK),--quick) $(if $(ONLY),--only $(foreach part,$(ONLY),$(call q,$(part)))) $(if $(WRITE),--write)
 
 profile: install  ## a flame graph of one HiPPO iteration on Ant Gather, docs/pictures/profile_ant_gather.svg

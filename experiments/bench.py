@@ -16,6 +16,7 @@ import torch
 from experiments import (
     bench_environments,
     bench_iterations,
+    bench_learning,
     bench_memory,
     bench_peers,
     bench_scaling,
@@ -44,7 +45,9 @@ PARTS = {
     "memory": Part(bench_memory.rows, 140, 30),
     "workers": Part(bench_sweeps.rows, 140, 30),
     "fig3": Part(bench_sweeps.front_door, 220, 0),
+    "learning": Part(bench_learning.rows, 3000, 60),
 }
+APART = ("learning",)  # too long for the whole: done only where it is named
 
 
 def measure(names: list[str], quick: bool, show: Callable[[str], None]) -> dict[str, float]:
@@ -89,7 +92,7 @@ def main(arguments: list[str] | None = None) -> int:
     about = bench_targets.machine()
     print(about)
     try:
-        measured = measure(options.only or list(PARTS), options.quick, show)
+        measured = measure(options.only or [name for name in PARTS if name not in APART], options.quick, show)
     except KeyboardInterrupt:
         print("\nstopped; nothing was written", file=sys.stderr)
         return 130

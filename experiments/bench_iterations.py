@@ -38,8 +38,8 @@ ROUNDS = {"ant_gather": 3, "snake_gather": 3, "block_hopper": 7, "block_half_che
 ENVIRONMENTS = tuple(ROUNDS)
 LEARNERS = {"hippo": "HiPPO random p", "ppo": "PPO"}
 CLOCKED: dict[str, list[tuple[Any, str]]] = {
-    "hippo": [(hippo.hippo, "collect"), (hippo.hippo, "maximize"), (Baselines, "fit")],
-    "ppo": [(baselines.ppo, "collect"), (baselines.ppo, "maximize"), (ValueFunction, "fit")],
+    "hippo": [(hippo.hippo, "collect"), (hippo.hippo, "improve"), (Baselines, "fit")],
+    "ppo": [(baselines.ppo, "collect"), (baselines.ppo, "improve"), (ValueFunction, "fit")],
 }
 Span = tuple[float, float]  # start and end, seconds
 
@@ -97,15 +97,15 @@ def _clocked(algo: str) -> dict[str, Span]:
 
 def parts(iteration: Iteration, bare: float) -> dict[str, float]:
     """Where the seconds of an iteration went, given the speed of bare stepping at that moment; they sum to `all`."""
-    collect, maximize, fit = (iteration.spans[name] for name in ("collect", "maximize", "fit"))
-    assert collect[1] <= maximize[0] <= maximize[1] <= fit[0]
+    collect, improve, fit = (iteration.spans[name] for name in ("collect", "improve", "fit"))
+    assert collect[1] <= improve[0] <= improve[1] <= fit[0]
     stepping_alone = iteration.steps / bare
     named = {
         "bare": stepping_alone,
         "environment": iteration.physics - stepping_alone,
         "acting": collect[1] - collect[0] - iteration.physics,
-        "advantages": maximize[0] - collect[1],
-        "gradients": maximize[1] - maximize[0],
+        "advantages": improve[0] - collect[1],
+        "gradients": improve[1] - improve[0],
         "fit": fit[1] - fit[0],
     }
     return {**named, "rest": iteration.seconds - sum(named.values()), "all": iteration.seconds}

@@ -7,6 +7,7 @@ import pytest
 from experiments import bench, bench_targets
 from experiments.bench_flame import labelled
 from experiments.bench_iterations import Iteration, parts
+from experiments.bench_learning import Point, seconds_to, totals, walls_at
 from experiments.bench_measure import Row, beside, contestants, median_ratio, median_reference, median_speed
 from experiments.bench_targets import Target, closing, with_block
 
@@ -82,7 +83,7 @@ def test_a_contestant_that_dies_is_named():
 
 def test_the_parts_of_an_iteration_sum_to_all_of_it():
     # Collected from 1 to 6 s, of which 4 in the environments; 800 steps at a bare speed of 250 are 3.2 s of them.
-    spans = {"collect": (1.0, 6.0), "maximize": (6.5, 8.0), "fit": (8.25, 9.0)}
+    spans = {"collect": (1.0, 6.0), "improve": (6.5, 8.0), "fit": (8.25, 9.0)}
     shares = parts(Iteration(800, 10.0, 4.0, spans), bare=250.0)
     assert shares == pytest.approx(
         {
@@ -224,3 +225,20 @@ def test_every_frame_of_the_flame_graph_that_has_room_gets_a_label():
     assert '<text x="0"></text>' in drawn
     assert "<script" not in drawn
     assert "onload" not in drawn
+
+
+def test_the_race_averages_over_a_window_and_takes_the_time_of_the_first_window_that_reaches_the_goal():
+    curve = [Point(steps, steps / 1000, steps / 100_000) for steps in range(10_000, 410_000, 10_000)]
+    assert walls_at(curve, 300_000) == pytest.approx(2.55)  # the ten from 2.1 to 3
+    assert seconds_to(curve, 2.55) == 300
+    assert seconds_to(curve, 99.0) == float("inf")
+    table = {"PPO, ours": [6.0, 4.0], "PPO, Stable-Baselines3": [10.0, 10.0]}
+    assert [row.ratio for row in totals("block_hopper", table)] == [0.5, 1.0]
+
+
+def test_the_race_is_run_only_where_it_is_named(short, monkeypatch, capsys):
+    bench.PARTS["learning"] = bench.Part(lambda _: iter(["a race"]), 60, 6)
+    assert bench.main([]) == 0
+    assert "a race" not in capsys.readouterr().out
+    assert bench.main(["--only", "learning"]) == 0
+    assert "a race" in capsys.readouterr().out
