@@ -43,10 +43,8 @@ def key(run: Run) -> str:
     """What the cost of a step depends on."""
     cpu = hashlib.sha256(cpu_name().encode()).hexdigest()[:8]
     revision = algorithm(run.algo).REVISION
-    physics = run.options.get("physics", "paper")
-    return (
-        f"{run.algo}-{revision} {run.env} {physics} torch-{installed('torch')} mujoco-{installed('mujoco')} cpu-{cpu}"
-    )
+    versions = f"torch-{installed('torch')} mujoco-{installed('mujoco')} cpu-{cpu}"
+    return kind(run).replace(run.algo, f"{run.algo}-{revision}", 1) + f" {versions}"
 
 
 @functools.cache
@@ -78,7 +76,8 @@ def seconds(run: Run, table: dict[str, Any] | None = None) -> float:
 
 def kind(run: Run) -> str:
     """What the committed cost of a step depends on."""
-    return f"{run.algo} {run.env} {run.options.get('physics', 'paper')}"
+    protocol = "" if run.protocol == Run.protocol else f" {run.protocol}"
+    return f"{run.algo} {run.env} {run.options.get('physics', 'paper')}{protocol}"
 
 
 @functools.cache
