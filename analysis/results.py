@@ -91,7 +91,7 @@ def table_section(results: Results) -> list[str]:
         cells = [f"{values[metric, env, variant]:.3g}" for env, variant in shown]
         lines.append(f"| {metric} | {' | '.join(cells)} |")
     seeds = results.frame.groupby(["env", "variant"])["seed"].nunique()
-    command = f"`make {plan['figure']} SCALE={plan['scale']}`"
+    command = f"`make draw-{plan['figure']} SCALE={plan['scale']}`"
     lines += ["", f"{seeds.min()} seeds. {command} names each definition and puts the paper's values beside it.", ""]
     return lines
 
