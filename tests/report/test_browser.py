@@ -146,3 +146,16 @@ def test_text_stands_out_from_its_background_by_wcag_aa(browser, page, dark):
         dim, bright = sorted((luminance(text), luminance(back)))
         assert (bright + 0.05) / (dim + 0.05) >= 4.5, (text, back)
     assert (luminance("page") < 0.05) == dark
+
+
+@pytest.mark.parametrize(("width", "shape"), [(390, (400, 900)), (1280, (1600, 500))])
+def test_on_a_phone_a_pictures_panels_stack_and_nothing_is_cut(browser, tmp_path, width, shape):
+    artefacts.picture(tmp_path / "out/smoke/fig3.png", "fig3: A title")
+    artefacts.picture(tmp_path / "out/smoke/fig3.narrow.png", "fig3: A title", size=(400, 900))
+    assert report.main(["--runs-dir", str(tmp_path / "runs"), "--out", str(tmp_path / "out")]) == 0
+    browser.open(tmp_path / "out/smoke/report.html", width)
+    picture = "document.querySelector('figure img')"
+    left, right, high = browser.ask(f"(r => [r.left, r.right, r.height])({picture}.getBoundingClientRect())")
+    assert 0 <= left < right <= width
+    assert high / (right - left) == pytest.approx(shape[1] / shape[0], rel=0.1)  # padding and border aside
+    assert browser.console() == []
