@@ -173,7 +173,12 @@ def test_a_run_leaves_what_it_is_where_it_came_from_and_what_it_measured(tmp_pat
     assert manifest["versions"]["mujoco"] == "3.17.0"
     assert Run.from_yaml(manifest["config"], tmp_path).run_id == run.run_id
     assert (run.folder / "progress.csv").read_text().count("\n") == 4
-    assert "iteration 3/3" in capsys.readouterr().out
+    said = capsys.readouterr().out.splitlines()
+    assert "iteration 3/3" in said[-2]
+    assert said[-1].startswith(f"finished: {run.folder}  evaluate: python -m experiments.evaluate {run.folder}  ")
+    assert f"video: make video RUN={run.folder}  " in said[-1]
+    assert f"compare: python -m paper_figures.compare {run.folder} " in said[-1]
+    assert status["return_mean"] == pytest.approx(float(said[-2].partition("return ")[2].split()[0]), abs=1e-3)
     before = (run.folder / "progress.csv").stat().st_mtime_ns
     assert train.main(arguments) == 0  # finished: nothing is trained again
     assert "is finished" in capsys.readouterr().out
