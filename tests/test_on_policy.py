@@ -10,7 +10,7 @@ from torch import nn
 from baselines import ppo
 from experiments.config import compose_run
 from experiments.evaluate import main as evaluate_main
-from hippo import hippo
+from hippo import gradients, hippo
 from hippo.core import seeding
 from hippo.core.advantages import Baselines, advantages
 from hippo.core.checkpoint import Checkpoint, CheckpointError, load, save
@@ -117,6 +117,21 @@ def test_the_returns_that_are_logged_are_those_of_the_environment(learner, confi
     where = state["baselines"] if learner is hippo else state["reward_scale"]
     variance = where["reward_scale.variance" if learner is hippo else "variance"]
     assert logged[0] / float(variance.sqrt()) > -10  # the wrong variant, scaled rewards, would be seen
+
+
+def test_a_measurement_scales_rewards_as_training_did_and_leaves_the_scale_alone(tmp_path):
+    config = hippo_config()
+    run(hippo.train, config, tmp_path)
+    baselines, iteration = gradients.restored_baselines(config, TargetEnv(1, 0), Checkpoint(tmp_path))
+    assert iteration == 3
+    policy = restored_policy(config, TargetEnv(1, 0), Checkpoint(tmp_path))
+    steps = collect(policy, TargetEnv(20, 0), config, 0, iteration).steps
+    variance = float(load(tmp_path / "checkpoint.pt")["baselines"]["reward_scale.variance"])
+    baselines.scale_rewards(steps, config.gamma, frozen=True)
+    torch.testing.assert_close(steps.scaled_reward, (steps.reward / variance**0.5).clamp(-10, 10))
+    assert float(baselines.reward_scale.variance) == variance
+    measured = gradients.measure(config, lambda n, _: TargetEnv(n, 0), 0, Checkpoint(tmp_path))
+    assert all(np.isfinite(value) for value in measured.values())
 
 
 def test_the_first_batch_is_not_learnt_from_but_fills_the_statistics(tmp_path):
