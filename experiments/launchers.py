@@ -49,7 +49,17 @@ def cause(exit_code: int) -> str:
     return signal.Signals(-exit_code).name if exit_code < 0 else f"exit code {exit_code}"
 
 
-def run_locally(runs: Sequence[Run], workers: int, on_change: Callable[[dict[str, Run], int], None]) -> dict[str, str]:
+def queue_of(runs: Sequence[Run], in_order: bool) -> list[Run]:
+    """`runs` as they are given, or those that others need first, then the longest, so that the pool ends together."""
+    if in_order:
+        return list(runs)
+    table, needed = costs.known(), {a.run_id for run in runs for a in run.ancestors}
+    return sorted(runs, key=lambda run: (run.run_id not in needed, -costs.seconds(run, table)))
+
+
+def run_locally(
+    runs: Sequence[Run], workers: int, on_change: Callable[[dict[str, Run], int], None], in_order: bool = False
+) -> dict[str, str]:
     """Train `runs` in a pool, parents before what depends on them, the longest first.
 
     A worker that dies fails its own run only, and is replaced. On Ctrl-C every worker abandons its iteration and the
@@ -57,14 +67,14 @@ def run_locally(runs: Sequence[Run], workers: int, on_change: Callable[[dict[str
 
     Args:
         on_change: called about once a second with the runs in progress, by id, and the number of those that ended.
+        in_order: as they are given instead, as far as parents allow.
 
     Returns:
         Run id -> final state.
     """
-    context, table = multiprocessing.get_context("spawn"), costs.known()
+    context = multiprocessing.get_context("spawn")
     chosen = {run.run_id for run in runs}
-    needed = {a.run_id for run in runs for a in run.ancestors}
-    queue = sorted(runs, key=lambda run: (run.run_id not in needed, -costs.seconds(run, table)))
+    queue = queue_of(runs, in_order)
     states: dict[str, str] = {}
     pool: list[Worker] = []
 

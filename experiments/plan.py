@@ -40,6 +40,7 @@ class Plan:
     description: dict[str, Any]  # conf/figure/<figure>.yaml
     fresh: bool  # committed results do not count
     entries: list[Entry]
+    whole: "Plan | None" = None  # of which this is a part
 
     def runs(self) -> list[Run]:
         """Its runs and what they depend on, each once, parents first."""
@@ -58,13 +59,29 @@ class Plan:
         return [parent, *self._missing_ancestors(parent)]
 
     def only(self, run_ids: Sequence[str]) -> "Plan":
-        """The same plan with no other entries; ConfigError for a run that is not in it."""
+        """The part of the plan with these runs; ConfigError for a run that is not in it."""
         for run_id in run_ids:
             check_choice("only", run_id, [e.run.run_id for e in self.entries])
-        return dataclasses.replace(self, entries=[e for e in self.entries if e.run.run_id in run_ids])
+        return self._part([e for e in self.entries if e.run.run_id in run_ids])
+
+    def within(self, environments: Sequence[str]) -> "Plan":
+        """The part of the plan in these environments, in this order; ConfigError for one that it does not train in."""
+        for env in environments:
+            check_choice("env", env, list(dict.fromkeys(e.run.env for e in self.entries)))
+        return self._part([e for env in environments for e in self.entries if e.run.env == env])
+
+    def by_seed(self) -> "Plan":
+        """The plan with whole comparisons one after another: seed 0 in every environment, then seed 1 and so on."""
+        return self._part(sorted(self.entries, key=lambda e: e.run.seed))
+
+    def _part(self, entries: list[Entry]) -> "Plan":
+        return dataclasses.replace(self, entries=entries, whole=self.whole or self)
 
     def write(self, runs_dir: Path) -> Path:
-        """Write the plan for analysis and drawing, which read nothing else but run folders and committed rows."""
+        """Write the plan for analysis and drawing, which read nothing else but run folders and committed rows.
+
+        Of a part the whole is written: what there is to draw does not depend on what was trained last.
+        """
         path = runs_dir / "plans" / self.scale / f"{self.figure}.json"
         path.parent.mkdir(parents=True, exist_ok=True)
         left_out = self.description.get("not_trained", {}).get(self.scale, [])
@@ -89,7 +106,7 @@ class Plan:
                     "ancestors": [run.run_id for run in e.run.ancestors],
                     "state": e.state,
                 }
-                for e in self.entries
+                for e in (self.whole or self).entries
             ],
             "claims": self.description.get("claims", []),
             "notes": self.description.get("notes", []),

@@ -8,6 +8,7 @@ python -m experiments.sweep retry fig3                 once more what the machin
 """
 
 import argparse
+import functools
 import os
 import shutil
 import signal
@@ -25,6 +26,7 @@ from experiments.status import DONE, read_status
 from hippo.core.settings import ConfigError
 
 LAUNCHERS = ("local", "slurm")
+ORDERS = ("longest", "seeds")
 REPORT_SECONDS = 10.0  # between two progress lines
 NAMED = 4  # runs in progress that a progress line names
 CORE_HOURS = 2.0  # more than this is not started without being agreed to
@@ -34,11 +36,12 @@ MAX_ATTEMPTS = 3  # of a run that the machine made fail, before `retry` leaves i
 Report = Callable[[Sequence[Run], int], None]  # takes the runs in progress and the number of those that ended
 
 
-def train_all(todo: Sequence[Run], workers: int, report: Report) -> dict[str, str]:
+def train_all(todo: Sequence[Run], workers: int, report: Report, in_order: bool = False) -> dict[str, str]:
     """Train `todo`; runs that another launch is training are waited for, and taken over should it give up.
 
     Args:
         report: called about once a second.
+        in_order: as they are given, not the longest first.
     """
     states: dict[str, str] = {}
     here = list(todo)
@@ -48,7 +51,7 @@ def train_all(todo: Sequence[Run], workers: int, report: Report) -> dict[str, st
         def on_change(active: dict[str, Run], ended: int, before: int = before) -> None:
             report(list(active.values()), before + ended)
 
-        states |= run_locally(here, workers, on_change)
+        states |= run_locally(here, workers, on_change, in_order)
         elsewhere = [run for run in todo if states[run.run_id] == "running"]
         here = []
         while elsewhere and not here:
@@ -205,6 +208,12 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--wait", action="store_true", help="slurm: return when the jobs have ended, not at once")
     parser.add_argument("--runs-dir", type=Path, default=Path("runs"))
     parser.add_argument("--fresh", action="store_true", help="ignore committed results")
+    parser.add_argument("--env", type=lambda text: text.split(","), metavar="NAME[,NAME...]", help="only in these")
+    parser.add_argument(
+        "--order",
+        default=ORDERS[0],
+        help="local: the longest run first, or seeds: all variants of seed 0, then of 1...",
+    )
     parser.add_argument("--only", action="append", metavar="RUN_ID", help="nothing but this run and what it needs")
     parser.add_argument("--max-core-hours", type=float, default=CORE_HOURS, help="start no more than this unasked")
     parser.add_argument("--yes", action="store_true", help="start it all the same")
@@ -219,6 +228,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     def plan_of(figure: str) -> Plan:
         plan = make_plan(figure, options.scale, options.set, options.fresh, options.runs_dir)
+        plan = plan.within(options.env) if options.env and plan.entries else plan
+        plan = plan.by_seed() if options.order == "seeds" else plan
         return plan.only(options.only) if options.only else plan
 
     try:
@@ -231,6 +242,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def check_options(options: argparse.Namespace) -> None:
     """Raise ConfigError for what argparse does not check."""
     check_choice("launcher", options.launcher, LAUNCHERS)
+    check_choice("order", options.order, ORDERS if options.launcher == "local" else ORDERS[:1])
     if options.workers < 1:
         raise ConfigError("workers", options.workers, "must be at least 1")
     if not options.max_core_hours >= 0:  # neither negative nor nan, which is above nothing
@@ -289,7 +301,9 @@ def run_or_retry(options: argparse.Namespace, plan_of: Callable[[str], Plan]) ->
         return 0
     plan.write(options.runs_dir)
     if profile is None:
-        return run_figure(plan, todo, lambda runs, report: train_all(runs, options.workers, report), options.runs_dir)
+        in_order = options.order == "seeds"
+        train = functools.partial(train_all, workers=options.workers, in_order=in_order)
+        return run_figure(plan, todo, lambda runs, report: train(runs, report=report), options.runs_dir)
     if not options.wait:
         return 0
     return run_figure(plan, todo, lambda runs, report: slurm.wait(runs, options.runs_dir, report), options.runs_dir)

@@ -1,6 +1,7 @@
 """What a plan promises: each run once, parents first, what it costs; what is retried; a full disk."""
 
 import dataclasses
+import functools
 import json
 import os
 import subprocess
@@ -84,6 +85,52 @@ def test_one_run_of_a_figure_can_be_picked_and_brings_what_it_needs(tmp_path, ca
     error = capsys.readouterr().err
     assert "only=nonsense" in error
     assert other.run_id in error
+
+
+def test_whole_comparisons_come_one_after_another_in_the_environments_asked_for(tmp_path, monkeypatch):
+    monkeypatch.setitem(FIGURES["one"], "environments", ["block_hopper", "block_half_cheetah", "ant_gather"])
+    begun = []
+    monkeypatch.setattr(sweep, "run_locally", functools.partial(one_after_another, begun))
+    arguments = ["run", "one", "--runs-dir", str(tmp_path), "--order", "seeds"]
+    assert sweep.main([*arguments, "--env", "block_half_cheetah,block_hopper"]) == 0
+    assert [(run.seed, run.env, run.algo) for run in begun] == [
+        (seed, env, algo)
+        for seed in (0, 1)
+        for env in ("block_half_cheetah", "block_hopper")
+        for algo in ("hippo", "ppo")
+    ]
+    written = json.loads((tmp_path / "plans/smoke/one.json").read_text())["runs"]
+    assert {run["env"] for run in written} == {"block_hopper", "block_half_cheetah", "ant_gather"}
+    assert {run["state"] for run in written if run["env"] != "ant_gather"} == {"finished"}
+
+
+def one_after_another(begun, todo, workers, on_change, in_order):
+    """Stands in for the pool."""
+    begun += todo if in_order else []
+    return {run.run_id: "finished" for run in todo}
+
+
+def test_the_pool_takes_the_longest_first_after_what_others_need_unless_it_is_to_keep_the_order(tmp_path):
+    short, long, middle = (compose_run([*TINY, f"iterations={n}", f"runs_dir={tmp_path}"]) for n in (1, 3, 2))
+    after = dataclasses.replace(short, kind="measure")
+    runs = [short, after, long, middle]
+    assert launchers.queue_of(runs, in_order=True) == runs
+    assert launchers.queue_of(runs, in_order=False) == [short, long, after, middle]  # measuring takes two batches
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--env", "snake_gather"], "env=snake_gather: valid: block_hopper"),
+        (["--env", "block_hopper,"], "env=: valid: block_hopper"),
+        (["--order", "env"], "order=env: valid: longest, seeds"),
+        (["--order", "seeds", "--launcher", "slurm"], "order=seeds: valid: longest"),
+    ],
+)
+def test_an_environment_or_order_that_does_not_exist_is_refused_in_one_line(arguments, message, tmp_path, capsys):
+    assert sweep.main(["run", "one", *arguments, "--runs-dir", str(tmp_path / "runs")]) == 2
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "runs").exists()
 
 
 def test_an_evaluation_depends_on_the_trained_run_of_another_figure(tmp_path):
