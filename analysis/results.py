@@ -24,7 +24,8 @@ been trained. `python -m analysis.explain paper_figures/data/laptop/fig3.csv` li
 [reproduce.md](reproduce.md) says how to train any of them again.
 """
 FINAL = """Return over the last 10 % of iterations, mean ± standard deviation over seeds, and area under the curve (mean
-return over all iterations). With three seeds these decide little: the verdicts below use intervals.
+return over all iterations). With three seeds these decide little: the verdicts below use intervals. The curves in the
+pictures are smoothed ([reproduce.md](reproduce.md)), the numbers are not.
 """
 
 

@@ -79,8 +79,8 @@ def draw(axes: Axes, left: float = LABELS, right: float = COLUMNS[-1] + 0.8) -> 
     for y, role in ((TOP, "manager"), (MIDDLE, "sub-policy\n(skill)"), (BOTTOM, "environment")):
         axes.text(LABELS, y, role, ha="left", va="center", fontsize=8, color="#555555")
     axes.set_xlim(left, right)
-    for text in axes.texts:
-        text.set_clip_on(True)
+    for text in axes.texts:  # which the panel's edges would not cut off
+        text.set_visible(left <= text.get_position()[0] <= right)
     axes.set_ylim(-1.2, TOP + 0.5)
     axes.set_aspect("equal")
     axes.axis("off")

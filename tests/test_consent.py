@@ -79,16 +79,19 @@ def test_plans_are_written_without_measuring_anything(tmp_path):
     assert [path for path in tmp_path.rglob("*") if path.is_file()] == [tmp_path / "plans/laptop/fig6.json"]
 
 
+@pytest.mark.slow  # every plan takes a quarter of a minute
 def test_the_scales_of_a_figure_are_those_that_leave_an_environment(plans):
     for (figure, scale), plan in plans.items():
         assert (scale in trained_at(plan.description)) == bool(plan.entries), figure
 
 
+@pytest.mark.slow  # every plan takes a quarter of a minute
 def test_every_planned_run_has_a_committed_cost(plans):
     kinds = {costs.kind(run) for plan in plans.values() for run in plan.runs()}
     assert kinds == set(costs.reference()["seconds_per_step"]), "run `python -m experiments.cost_table --measure`"
 
 
+@pytest.mark.slow  # every plan takes a quarter of a minute
 def test_the_readmes_costs_are_those_that_decide(plans):
     written = cost_table.MARK.search(cost_table.README.read_text())
     assert written is not None
@@ -137,6 +140,14 @@ def test_so_do_those_of_a_sweep_and_a_video():
     assert (value(words, "--profile"), value(words, "--workers")) == (HOSTILE, "3; x")
     assert value(words, "--launcher") == "slurm"
     assert recipe("video", "RUN=x; cmd")[-1][-2:] == ["experiments.video", "x; cmd"]
+
+
+def test_all_goes_on_to_the_tables_whatever_becomes_of_a_figure():
+    first, *rest = recipe("all", "SCALE=laptop")
+    assert "--keep-going" in first
+    swept = [words[words.index("run") + 1] for words in rest if "experiments.sweep" in words and "run" in words]
+    assert {"fig3", "fig8", "table1", "table2"} <= set(swept)
+    assert any(words[-6:-4] == ["paper_figures.draw", "table3"] for words in rest)
 
 
 def test_help_lists_every_variable_with_a_line():
