@@ -18,11 +18,12 @@ RUNS_DIR ?= runs
 BIN := .venv/bin
 PY = $(BIN)/python -m
 q = '$(subst ','\'',$(1))'# one word to the shell, whatever it holds
+given = $(call q,$(value $(1)))# a variable as it was typed: make reads no $ in it
 
-PLAN_FLAGS = --scale $(call q,$(SCALE)) --runs-dir $(call q,$(RUNS_DIR)) $(if $(FRESH),--fresh)
-SWEEP_FLAGS = $(PLAN_FLAGS) --launcher $(call q,$(LAUNCHER)) $(if $(YES),--yes) $(if $(filter slurm,$(LAUNCHER)),--wait)
-SWEEP_FLAGS += $(if $(PROFILE),--profile $(call q,$(PROFILE))) $(if $(WORKERS),--workers $(call q,$(WORKERS)))
-DRAW_FLAGS = --scale $(call q,$(SCALE)) --runs-dir $(call q,$(RUNS_DIR))
+PLAN_FLAGS = --scale $(call given,SCALE) --runs-dir $(call given,RUNS_DIR) $(if $(FRESH),--fresh)
+SWEEP_FLAGS = $(PLAN_FLAGS) --launcher $(call given,LAUNCHER) $(if $(YES),--yes) $(if $(filter slurm,$(LAUNCHER)),--wait)
+SWEEP_FLAGS += $(if $(value PROFILE),--profile $(call given,PROFILE)) $(if $(value WORKERS),--workers $(call given,WORKERS))
+DRAW_FLAGS = --scale $(call given,SCALE) --runs-dir $(call given,RUNS_DIR)
 
 FIGURES := $(filter fig%,$(basename $(notdir $(wildcard paper_figures/fig*.py))))
 TABLES := $(filter table%,$(basename $(notdir $(wildcard paper_figures/table*.py))))
@@ -30,8 +31,8 @@ TABLES := $(filter table%,$(basename $(notdir $(wildcard paper_figures/table*.py
 install: .venv/installed  ## make .venv with the locked versions (nothing to do when nothing changed)
 
 .venv/installed: requirements.lock pyproject.toml
-	@$(call q,$(PYTHON)) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "Python >= 3.11 is needed; set PYTHON=..." >&2; exit 2; }
-	$(call q,$(PYTHON)) -m venv .venv
+	@$(call given,PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "Python >= 3.11 is needed; set PYTHON=..." >&2; exit 2; }
+	$(call given,PYTHON) -m venv .venv
 	$(BIN)/pip install --quiet --disable-pip-version-check --requirement requirements.lock
 	$(BIN)/pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
 	@touch $@
@@ -112,8 +113,8 @@ install-render:  ## what off-screen drawing needs, by apt (as root)
 	apt-get update -qq && apt-get install -y -qq --no-install-recommends libegl1 libgl1-mesa-dri
 
 video: install  ## a video of a trained policy: make video RUN=runs/<run_id>
-	@[ -n $(call q,$(RUN)) ] || { echo "error: RUN=: name a run folder, as in make video RUN=runs/<run_id>" >&2; exit 2; }
-	@$(PY) experiments.video $(call q,$(RUN))
+	@[ -n $(call given,RUN) ] || { echo "error: RUN=: name a run folder, as in make video RUN=runs/<run_id>" >&2; exit 2; }
+	@$(PY) experiments.video $(call given,RUN)
 
 clean:  ## remove what was installed and trained here (asks nothing)
 	rm -rf .venv runs paper_figures/out build *.egg-info

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from pathlib import Path
 from collections.abc import Iterator, Sequence
 
 from experiments.bench_measure import Row, beside
@@ -25,8 +26,8 @@ def pool(workers: int, runs: int, iterations: int) -> tuple[float, float]:
     which imports torch, is not among them.
     """
     with tempfile.TemporaryDirectory() as folder:
-        settings = [*SETTINGS, f"iterations={iterations}", f"runs_dir={folder}"]
-        chosen = [compose_run([*settings, f"seed={seed}"]) for seed in range(runs)]
+        settings = [*SETTINGS, f"iterations={iterations}"]
+        chosen = [compose_run([*settings, f"seed={seed}"], Path(folder)) for seed in range(runs)]
         start = time.perf_counter()
         states = run_locally(chosen, workers, lambda *_: None)
         seconds = time.perf_counter() - start

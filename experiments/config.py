@@ -7,6 +7,7 @@ import functools
 import hashlib
 import importlib
 import json
+import operator
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import version
@@ -41,6 +42,8 @@ ALGORITHMS = {
     "hiro": ("baselines.hiro", "HiroConfig"),
 }
 BUDGET_FIELDS = ("iterations", "batch_size", "horizon")
+# Names and paths: the text after `key=` is taken as it is typed and never parsed, so it may hold any character.
+PLAIN_TEXT = ("runs_dir", "algo.skills", "wandb.project")
 # Filled in from the run level, or descriptions that no override should touch.
 NOT_OVERRIDDEN = {
     "budget",
@@ -186,8 +189,8 @@ class Run:
         shared = {name: getattr(self.config, name) for name in SHARED_WITH_SKILLS if hasattr(self.config, name)}
         overrides = [f"algo.{name}={json.dumps(value)}" for name, value in shared.items()]
         overrides += [f"env.{name}={value}" for name, value in self.options.items() if name == "observation"]
-        chosen = [f"env={robot}", f"algo={PRETRAINING[robot]}", f"scale={self.scale}", f"runs_dir={self.runs_dir}"]
-        return compose_run([*chosen, *overrides])
+        chosen = [f"env={robot}", f"algo={PRETRAINING[robot]}", f"scale={self.scale}"]
+        return compose_run([*chosen, *overrides], self.runs_dir)
 
     @functools.cached_property
     def identity(self) -> dict[str, Any]:
@@ -320,48 +323,61 @@ def _base(env: str, algo: str, scale: str, protocol: str) -> DictConfig:
     return config
 
 
-def compose_run(overrides: Sequence[str]) -> Run:
-    """The run described by `overrides` in Hydra's grammar, e.g. ["env=ant_gather", "algo.period_min=5"].
+def compose_run(overrides: Sequence[str], runs_dir: Path | None = None) -> Run:
+    """The run described by `overrides`, e.g. ["env=ant_gather", "algo.period_min=5"].
+
+    Values are in Hydra's grammar; those of PLAIN_TEXT are taken as they are typed.
+
+    Args:
+        runs_dir: where the run lives, if not where the overrides say.
 
     Raises:
         ConfigError: an unknown group choice or key, a value of the wrong type or out of range.
     """
     groups = {"env": "block_hopper", "algo": "hippo", "scale": "paper", "protocol": "paper"}
+    names: dict[str, str] = {}
     settings = []
-    for override in _parse(overrides):
-        key = override.key_or_group
-        if key in groups:
-            valid = list(ALGORITHMS) if key == "algo" else choices(key)
-            groups[key] = check_choice(key, str(override.value()), valid)
-        else:
-            settings.append(override)
-    config = _base(**groups).copy()
-    for override in settings:
-        _apply(config, override)
-    return _validated(config, groups["algo"])
-
-
-def _parse(overrides: Sequence[str]) -> list[Override]:
-    parsed = []
     for text in overrides:
         key, equals, value = text.partition("=")
         if not key or not equals:
             raise ConfigError(key, value, "settings are given as key=value")
-        with _as_config_error(key, value):
-            (override,) = OverridesParser.create().parse_overrides([text])
-        if override.is_sweep_override() or override.is_add() or override.is_delete():
-            raise ConfigError(key, value, "plain key=value overrides only; sweeps are experiments.sweep's")
-        parsed.append(override)
-    return parsed
+        if key in PLAIN_TEXT:
+            names[key] = unquoted(value)
+        elif key in groups:
+            valid = list(ALGORITHMS) if key == "algo" else choices(key)
+            groups[key] = check_choice(key, str(_parsed(key, text).value()), valid)
+        else:
+            settings.append(_parsed(key, text))
+    if runs_dir is not None:
+        names["runs_dir"] = str(runs_dir)
+    config = _base(**groups).copy()
+    for override in settings:
+        _check_key(config, override.key_or_group, override.value())
+        with _as_config_error(override.key_or_group, override.value()):
+            OmegaConf.update(config, override.key_or_group, override.value())
+    for key, name in names.items():
+        _check_key(config, key, name)
+    return _validated(config, groups["algo"], names)
 
 
-def _apply(config: DictConfig, override: Override) -> None:
-    key, value = override.key_or_group, override.value()
+def unquoted(text: str) -> str:
+    """`text` without one pair of quotes around it, which Hydra's grammar would ask for and a shell may leave."""
+    return text[1:-1] if len(text) > 1 and text[0] == text[-1] and text[0] in "'\"" else text
+
+
+def _parsed(key: str, text: str) -> Override:
+    value = text.partition("=")[2]
+    with _as_config_error(key, value):
+        (override,) = OverridesParser.create().parse_overrides([text])
+    if override.is_sweep_override() or override.is_add() or override.is_delete():
+        raise ConfigError(key, value, "plain key=value overrides only; sweeps are experiments.sweep's")
+    return override
+
+
+def _check_key(config: DictConfig, key: str, value: Any) -> None:
     known = sorted(_keys(config))
     if key not in known:
         raise ConfigError(key, value, f"no such key; {nearest(key, known)}")
-    with _as_config_error(key, value):
-        OmegaConf.update(config, key, value)
 
 
 def _keys(node: DictConfig, prefix: str = "") -> Iterator[str]:
@@ -405,10 +421,12 @@ def _check_skills(path: str, env: dict[str, Any], settings: dict[str, Any]) -> N
             raise ConfigError("algo.skills", path, f"has {key} {metadata[key]}, this run needs {value}")
 
 
-def _validated(config: DictConfig, algo: str) -> Run:
+def _validated(config: DictConfig, algo: str, names: dict[str, str]) -> Run:
     with _as_config_error("config", algo):
-        plain = OmegaConf.to_container(config, resolve=True)
-    assert isinstance(plain, dict)
+        plain: Any = OmegaConf.to_container(config, resolve=True)
+    for key, value in names.items():  # here, where nothing is parsed or interpolated any more
+        *groups, name = key.split(".")
+        functools.reduce(operator.getitem, groups, plain)[name] = value
     env: dict[str, Any] = plain["env"]
     with _of_algo():
         settings = config_class(algo)(**plain["algo"])

@@ -137,7 +137,7 @@ def returns_row(run: Run, description: str) -> str:
 def briefly_trained(env: str) -> str:
     """The row of a policy that is trained here and now."""
     with tempfile.TemporaryDirectory() as folder:
-        run = compose_run([f"env={env}", "algo=hippo", *TRAINING, f"runs_dir={folder}"])
+        run = compose_run([f"env={env}", "algo=hippo", *TRAINING], Path(folder))
         if train.execute(run) != "finished":
             raise RuntimeError(f"training on {env} did not finish")
         return returns_row(run, described(run))

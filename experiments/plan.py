@@ -162,10 +162,10 @@ def make_plan(figure: str, scale: str, settings: Sequence[str], fresh: bool, run
         for variant, what in description["variants"].items():
             if env not in what.get("environments", [env]):
                 continue
-            chosen = [f"env={env}", f"algo={what['algo']}", f"scale={scale}", f"runs_dir={runs_dir}"]
+            chosen = [f"env={env}", f"algo={what['algo']}", f"scale={scale}"]
             kind = what.get("kind", description.get("kind"))
             of_scale = what.get("scale_settings", {}).get(scale, [])
-            first = compose_run([*chosen, *of_env, *what.get("settings", []), *of_scale, *settings])
+            first = compose_run([*chosen, *of_env, *what.get("settings", []), *of_scale, *settings], runs_dir)
             if kind is not None:
                 evaluation = description["evaluation"] if kind == "evaluate" else None
                 first = dataclasses.replace(first, kind=kind, evaluation=evaluation)

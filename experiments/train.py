@@ -24,7 +24,7 @@ import torch
 from filelock import FileLock, Timeout
 
 from experiments.command_line import EXIT_DIVERGED, EXIT_FAILED, EXIT_REQUEUE, bad_input, clock
-from experiments.config import PRETRAINED, Run, algorithm, committed_skills, compose_run
+from experiments.config import PRETRAINED, Run, algorithm, committed_skills, compose_run, unquoted
 from experiments.evaluate import as_csv, evaluate_all
 from experiments.manifest import from_manifest, manifest_with_history
 from experiments.status import HEARTBEAT_SECONDS, Status, is_there, read_status, write_atomically
@@ -234,7 +234,7 @@ def _from_manifest(arguments: list[str]) -> Run:
     path, settings = arguments[1:2], arguments[2:]
     if not path or len(settings) > 1 or not all(s.startswith("runs_dir=") for s in settings):
         raise ConfigError("from-manifest", " ".join(arguments[1:]), "takes a manifest.json and at most runs_dir=FOLDER")
-    return from_manifest(Path(path[0]), Path(settings[0].removeprefix("runs_dir=") if settings else "runs"))
+    return from_manifest(Path(path[0]), Path(unquoted(settings[0].removeprefix("runs_dir=")) if settings else "runs"))
 
 
 if __name__ == "__main__":
