@@ -61,6 +61,7 @@ KIND_REVISIONS = {"measure": 1, "evaluate": 1}
 PRETRAINING = {"ant": "snn", "snake": "snn", "hopper": "diayn", "half_cheetah": "diayn"}  # robot -> algorithm
 PRETRAINED = "pretrained"  # value of algo.skills: the skills that the robot's pre-training run makes
 SHARED_WITH_SKILLS = ("num_skills", "skill_hidden_sizes", "skill_integration", "log_std_per_skill")
+ONE_VALUE = "must be key=value with one value, which --set gives to every run of a sweep; start one per value"
 WANDB_MODES = ("disabled", "offline", "online")
 
 installed = functools.cache(version)  # reading a package's metadata takes 3 ms, and a plan asks a thousand times
@@ -370,7 +371,7 @@ def _parsed(key: str, text: str) -> Override:
     with _as_config_error(key, value):
         (override,) = OverridesParser.create().parse_overrides([text])
     if override.is_sweep_override() or override.is_add() or override.is_delete():
-        raise ConfigError(key, value, "plain key=value overrides only; sweeps are experiments.sweep's")
+        raise ConfigError(key, value, ONE_VALUE)
     return override
 
 

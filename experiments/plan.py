@@ -190,7 +190,10 @@ def summary(plan: Plan) -> str:
     )
 
 
-COLUMNS = ("figure", "runs", "shared", "done", "running", "failed", "missing", "env steps", "core-hours", "disk")
+COLUMNS = (
+    *("figure", "runs", "shared", "done", "running", "preempted", "failed", "missing"),
+    *("env steps", "core-hours", "disk"),
+)
 
 
 def overview(plans: Sequence[Plan], workers: int) -> str:
@@ -229,16 +232,18 @@ def _state(run: Run, fresh: bool) -> str:
 
 def _line(name: str, states: dict[str, str], shared: int, todo: Sequence[Run], table: dict[str, Any]) -> str:
     count = Counter(states.values())
-    failed = sum(count[state] for state in ("failed", "diverged", "lost", "preempted"))
+    failed = sum(count[state] for state in ("failed", "diverged", "lost"))
     done, running = sum(count[state] for state in DONE), count["running"] + count["pending"]
+    preempted = count["preempted"]  # not failed: the same command continues it
+    missing = len(states) - done - running - preempted - failed
     steps, seconds = sum(run.env_steps for run in todo), sum(costs.seconds(run, table) for run in todo)
     disk = sum(costs.disk(run, table) for run in todo)
-    numbers = (len(states), shared, done, running, failed, len(states) - done - running - failed)
+    numbers = (len(states), shared, done, running, preempted, failed, missing)
     return _row((name, *numbers, f"{steps / 1e6:,.1f} M", f"{seconds / 3600:,.2f}", f"{disk / 1e6:,.1f} MB"))
 
 
 def _row(cells: Sequence[Any]) -> str:
-    widths = (9, 6, 7, 6, 8, 7, 8, 12, 11, 11)
+    widths = (9, 6, 7, 6, 8, 10, 7, 8, 12, 11, 11)
     return "".join(
         f"{cell:<{w}}" if i == 0 else f"{cell:>{w}}" for i, (cell, w) in enumerate(zip(cells, widths, strict=True))
     )

@@ -13,7 +13,7 @@ import pytest
 
 from experiments import costs, launchers, sweep, train
 from experiments.config import compose_run
-from experiments.plan import make_plan, overview
+from experiments.plan import make_plan, overview, summary
 from experiments.status import Status, read_status
 
 ROOT = Path(__file__).parent.parent
@@ -149,15 +149,28 @@ def test_the_overview_counts_shared_runs_once_and_costs_what_was_measured(tmp_pa
     lines = overview([plan("one", tmp_path), plan("two", tmp_path)], workers=2).splitlines()
     assert measured == [("hippo", "block_hopper"), ("ppo", "block_hopper")]
     table = {line.split()[0]: line.split()[1:] for line in lines[1:4]}
-    # runs, shared, done, running, failed, missing, then 1600 and 1700 steps; 2 of one's 4 runs are shared
-    assert table["one"][:6] == ["4", "2", "0", "0", "0", "4"]
-    assert table["two"][:6] == ["4", "2", "0", "0", "0", "4"]
-    assert table["together"][:6] == ["6", "2", "0", "0", "0", "6"]
+    # runs, shared, done, running, preempted, failed, missing, then 1600 and 1700 steps; 2 of one's 4 runs are shared
+    assert table["one"][:7] == ["4", "2", "0", "0", "0", "0", "4"]
+    assert table["two"][:7] == ["4", "2", "0", "0", "0", "0", "4"]
+    assert table["together"][:7] == ["6", "2", "0", "0", "0", "0", "6"]
     steps = {name: round(sum(run.env_steps for run in plan(name, tmp_path).todo())) for name in ("one", "two")}
     assert steps == {"one": 1600, "two": 2 * 400 + 2 * 450}
     assert "wall-clock with 2 processes" in lines[4]
     overview([plan("one", tmp_path)], workers=2)
     assert len(measured) == 2  # remembered
+
+
+def test_a_preempted_run_is_counted_as_such_and_not_as_failed(tmp_path, measured):
+    for entry, state in zip(
+        plan("one", tmp_path).entries, ("preempted", "failed", "diverged", "preempted"), strict=True
+    ):
+        entry.run.folder.mkdir(parents=True)
+        Status(entry.run).end(state)
+    one = plan("one", tmp_path)
+    head, line, *_ = overview([one], workers=2).splitlines()
+    counts = dict(zip(head.split()[:8], line.split()[:8], strict=True))
+    assert (counts["preempted"], counts["failed"], counts["missing"]) == ("2", "2", "0")
+    assert "(1 diverged, 1 failed, 2 preempted)" in summary(one)
 
 
 def test_a_short_training_measures_time_and_size(tmp_path):

@@ -15,7 +15,7 @@ import pytest
 
 from experiments import launchers, sweep, train
 from experiments.command_line import EXIT_FAILED, EXIT_REQUEUE
-from experiments.config import compose_run
+from experiments.config import ONE_VALUE, compose_run
 from experiments.plan import FIXED, make_plan
 from experiments.status import Status, mark_lost, read_status
 
@@ -158,6 +158,15 @@ def test_what_the_plan_decides_cannot_be_set(key, tiny_figure, tmp_path, capsys)
 def test_overrides_that_name_nothing_are_refused(override, message, capsys):
     assert train.main([*TINY, override]) == 2
     assert message in capsys.readouterr().err
+
+
+def test_several_values_in_one_override_are_refused_with_what_works_for_a_run_and_for_a_sweep(tmp_path, capsys):
+    several = "algo.learning_rate=1e-3,3e-3"
+    assert train.main([*TINY, several]) == 2
+    assert sweep.main(["run", "fig3", "--runs-dir", str(tmp_path / "runs"), "--set", several]) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert lines == [f"error: {several}: {ONE_VALUE}"] * 2
+    assert not (tmp_path / "runs").exists()
 
 
 def test_a_lost_process_leaves_its_cause_unless_the_run_was_taken_over_or_is_done(tiny_run):
