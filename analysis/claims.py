@@ -6,7 +6,6 @@ as many as the sentence says), not reproduced if the interval excludes it in any
 than three seeds.
 """
 
-import argparse
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,6 +16,7 @@ import numpy as np
 import yaml
 from scipy import stats as scipy_stats
 
+from analysis.command_line import parser
 from analysis.predicates import KINDS, Kind, Pairs, Printed, Spec
 from analysis.runs import MissingData, Results, load
 
@@ -167,12 +167,7 @@ def lines(scale: str, runs_dir: Path, data_dir: Path) -> list[str]:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Print the table and write claims.md."""
-    parser = argparse.ArgumentParser(prog="analysis.claims", description=__doc__.splitlines()[0])
-    parser.add_argument("--scale", default="smoke", help="smoke, laptop or paper")
-    parser.add_argument("--runs-dir", type=Path, default=Path("runs"))
-    parser.add_argument("--data", type=Path, default=ROOT / "paper_figures" / "data", help="committed results")
-    parser.add_argument("--out", type=Path, default=ROOT / "paper_figures" / "out")
-    options = parser.parse_args(arguments)
+    options = parser("analysis.claims", __doc__.splitlines()[0]).parse_args(arguments)
     try:
         text = "\n".join(lines(options.scale, options.runs_dir, options.data)) + "\n"
     except ValueError as error:

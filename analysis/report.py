@@ -3,7 +3,6 @@
 The page carries its pictures, loads nothing and runs no script; every text is escaped, whatever a run is called.
 """
 
-import argparse
 import base64
 import os
 import re
@@ -18,7 +17,8 @@ from urllib.parse import quote
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup, escape
 
-from analysis.report_data import ROOT, Artefact, Report, RunFacts, Table, gather
+from analysis.command_line import parser
+from analysis.report_data import Artefact, Report, RunFacts, Table, gather
 from analysis.runs import MissingData
 
 HERE = Path(__file__).parent
@@ -185,12 +185,7 @@ def render(report: Report) -> tuple[str, str]:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Write report.html and report.md; exit code 2 where there is nothing to report."""
-    parser = argparse.ArgumentParser(prog="analysis.report", description=__doc__.splitlines()[0])
-    parser.add_argument("--scale", default="smoke", help="smoke, laptop or paper")
-    parser.add_argument("--runs-dir", type=Path, default=Path("runs"))
-    parser.add_argument("--data", type=Path, default=ROOT / "paper_figures" / "data", help="committed results")
-    parser.add_argument("--out", type=Path, default=ROOT / "paper_figures" / "out")
-    options = parser.parse_args(arguments)
+    options = parser("analysis.report", __doc__.splitlines()[0]).parse_args(arguments)
     try:
         report = gather(options.scale, options.runs_dir, options.data, options.out)
         pages = render(report)

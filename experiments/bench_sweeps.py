@@ -9,8 +9,8 @@ import subprocess
 import sys
 import tempfile
 import time
-from pathlib import Path
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 
 from experiments.bench_measure import Row, beside
 from experiments.config import Run, compose_run

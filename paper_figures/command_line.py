@@ -5,6 +5,7 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from analysis.command_line import parser
 from analysis.runs import MissingData, NotAtThisScale, Results, load
 
 HERE = Path(__file__).parent
@@ -14,13 +15,9 @@ BAD_INPUT, NOTHING_YET = 2, 3  # exit codes
 
 def parse(artefact: str, arguments: Sequence[str] | None) -> argparse.Namespace:
     """scale, runs_dir, data, out and smooth of one figure or table."""
-    parser = argparse.ArgumentParser(prog=f"paper_figures.{artefact}", description=f"Make {artefact}.")
-    parser.add_argument("--scale", default="smoke", help="smoke, laptop or paper")
-    parser.add_argument("--runs-dir", type=Path, default=Path("runs"))
-    parser.add_argument("--data", type=Path, default=HERE / "data", help="committed results")
-    parser.add_argument("--out", type=Path, default=HERE / "out")
-    parser.add_argument("--smooth", type=share, default=SMOOTH, help="learning curves: moving mean over this share")
-    return parser.parse_args(arguments)
+    made = parser(f"paper_figures.{artefact}", f"Make {artefact}.")
+    made.add_argument("--smooth", type=share, default=SMOOTH, help="learning curves: moving mean over this share")
+    return made.parse_args(arguments)
 
 
 def share(text: str) -> float:

@@ -6,9 +6,12 @@ from pathlib import Path
 
 import pytest
 
+from analysis import claims, report
+from analysis.command_line import SCALES
 from experiments import sweep, train
-from experiments.config import COMMITTED, compose_run
+from experiments.config import COMMITTED, choices, compose_run
 from experiments.plan import make_plan
+from paper_figures import draw
 
 TINY = ["env=block_hopper", "scale=smoke", "iterations=1", "batch_size=200"]
 FOLDERS = [
@@ -82,3 +85,45 @@ def test_a_skills_file_and_a_wandb_project_may_hold_any_character(tmp_path):
         compose_run(["algo.skills=it's"])
     with pytest.raises(ValueError, match=r"algo.skills=it's: no such key"):
         compose_run(["algo=ppo", "algo.skills=it's"])
+
+
+# ---------------------------------------------------------------------------------------------- one check of the scale
+
+
+def refused(main, arguments, capsys):
+    """What `main` says about arguments that it must refuse: at most three lines, exit code 2."""
+    try:
+        code = main(arguments)
+    except SystemExit as exit:
+        code = exit.code
+    said = capsys.readouterr()
+    assert code == 2
+    assert not said.out
+    assert said.err.count("\n") <= 3
+    return said.err
+
+
+@pytest.mark.parametrize("scale", ["nonsense", "../../tr", "", "Smoke"])
+@pytest.mark.parametrize("command", ["claims", "report", "sweep", "train", "all", "fig1", "fig2", "fig3", "table3"])
+def test_a_scale_that_does_not_exist_is_refused_by_every_command(command, scale, tmp_path, monkeypatch, capsys):
+    here = tmp_path / "here"
+    here.mkdir()
+    monkeypatch.chdir(here)
+    options = ["--scale", scale, "--runs-dir", "runs"]
+    mains = {"claims": claims.main, "report": report.main}
+    if command in mains:
+        said = refused(mains[command], [*options, "--out", "out"], capsys)
+    elif command == "sweep":
+        said = refused(sweep.main, ["write", "fig3", *options], capsys)
+    elif command == "train":
+        said = refused(train.main, [f"scale={scale}"], capsys)
+    else:
+        said = refused(draw.main, [command, *options, "--out", "out"], capsys)
+    assert "scale" in said
+    assert scale in said
+    assert all(valid in said for valid in SCALES)
+    assert not list(here.iterdir())
+
+
+def test_the_scales_of_the_analysis_are_those_that_are_trained():
+    assert sorted(SCALES) == choices("scale")
