@@ -205,7 +205,7 @@ class Agents(nn.Module):
         goal, relabelled = rows["goal"], torch.zeros(())
         if self.config.off_policy_correction:
             goal = self.relabel(rows, generator)
-            relabelled = (goal != rows["goal"]).any(-1).float().mean()
+            relabelled = (goal != rows["goal"]).any(-1).to(goal.dtype).mean()
         first, last = rows["obs"][:, 0], rows["obs"][:, -1]
         learnt = self.manager.update(first, goal, rows["reward"], last, rows["continues"], generator)
         return torch.cat([learnt, relabelled.unsqueeze(0)])
@@ -301,7 +301,7 @@ class Walk:
             "reward": reward,
             "next_obs": next_obs,
             "next_goal": next_goal,
-            "continues": 1.0 - self.steps.terminated[t].float(),
+            "continues": 1.0 - self.steps.terminated[t].to(obs.dtype),
         }
         return row, is_over, -reward
 
@@ -332,7 +332,7 @@ def skill_rollouts(config: HiroConfig, agents: Agents, memory: Memory, envs: Any
     next_obs, is_over = torch.empty_like(steps.obs[1:]), torch.zeros(T, N, dtype=torch.bool)
     skill, age = rng.integers(policy.num_skills, size=N), np.zeros(N, np.int64)
     for t in range(T):
-        noise = rng.standard_normal(steps.action.shape[1:], np.float32)
+        noise = rng.standard_normal(steps.action.shape[1:], steps.action.numpy().dtype)
         obs, done = steps.step(t, np.clip(act(obs[:, :size], skill, noise), -1, 1))
         next_obs[t] = torch.from_numpy(np.where(done[:, None], tapped.info.get("final_obs", obs), obs))
         age += 1
@@ -354,7 +354,7 @@ def skill_rollouts(config: HiroConfig, agents: Agents, memory: Memory, envs: Any
             "reward": goals.reward(steps.obs[t], goal[t], next_obs[t]),
             "next_obs": next_obs[t],
             "next_goal": goals.clip(next_goal[t]),
-            "continues": 1.0 - steps.terminated[t].float(),
+            "continues": 1.0 - steps.terminated[t].to(steps.obs.dtype),
         }
         memory.add(row, steps.reward[t], is_over[t])
 

@@ -77,7 +77,7 @@ def collect(
     noise = torch.randn(steps.action.shape, generator=seeding.torch_generator(seed, "policy", iteration)).numpy()
     noise *= not greedy
     is_decision = np.empty((T, N), bool)
-    action = np.empty((N, steps.action.shape[-1]), np.float32)
+    action = torch.empty(steps.action.shape[1:]).numpy()
     steps_left = np.zeros(N, np.int64)
     act, view = policy.actor(), actor_of(policy.filter)
     obs = view(steps.reset(seeding.integer(seed, "episodes", iteration)))

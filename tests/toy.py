@@ -31,7 +31,8 @@ class TargetEnv(gym.vector.VectorEnv):
         self.rng = np.random.default_rng(seed)
 
     def _draw(self) -> np.ndarray:
-        return self.rng.uniform(-1, 1, (self.num_envs, self.robot_size)).astype(np.float32)
+        obs = self.rng.uniform(-1, 1, (self.num_envs, self.robot_size))
+        return torch.from_numpy(obs).to(torch.get_default_dtype()).numpy()
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[np.ndarray, dict]:
         if seed is not None:

@@ -107,7 +107,7 @@ class Memory:
         self.goal[begins], self.reward[begins] = row["goal"][begins], 0.0
         self.obs[begins], self.action[begins] = 0.0, 0.0
         self.obs[envs, self.age], self.action[envs, self.age] = row["obs"], row["action"]
-        self.reward += self.scale * reward.float()
+        self.reward += self.scale * reward.to(self.reward.dtype)
         self.age += 1
         if is_over.any():
             self.obs[is_over, -1] = row["next_obs"][is_over]

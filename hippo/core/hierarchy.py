@@ -151,8 +151,10 @@ class Commitment:
         self.logits = policy.manager.actor()
         self.skill = np.zeros(num_envs, np.int64)  # (N,)
         self.steps_left = np.zeros(num_envs, np.int64)  # (N,)
-        self.time_left = np.zeros(num_envs, np.float32)  # (N,) steps left over the longest period, in (0, 1]
-        self._fraction = (np.arange(period_max + 1) / period_max).astype(np.float32)  # steps left -> time left
+        self.time_left = torch.zeros(num_envs).numpy()  # (N,) steps left over the longest period, in (0, 1]
+        self._fraction = (np.arange(period_max + 1) / period_max).astype(
+            self.time_left.dtype
+        )  # steps left -> time left
 
     def renew(self, obs: np.ndarray, period: np.ndarray, uniform: np.ndarray | None) -> np.ndarray:
         """Where a commitment has run out take the new `period` (N,), then let the manager choose.
@@ -196,7 +198,7 @@ def _advance(steps_left: np.ndarray, done: np.ndarray) -> None:
 
 def look(obs: np.ndarray, time_left: np.ndarray, where: np.ndarray, view: int, sees_time: bool) -> np.ndarray:
     """What a level sees in the rows `where` (K,): the first `view` entries of obs (N, D) and perhaps the time left."""
-    seen = np.empty((len(where), view + sees_time), np.float32)
+    seen = np.empty((len(where), view + sees_time), obs.dtype)
     _look(obs, time_left, where, view, seen)
     return seen
 
@@ -245,7 +247,7 @@ def collect(
     noise = torch.randn(steps.action.shape, generator=seeding.torch_generator(seed, "skills", iteration)).numpy()
     noise *= not greedy
     skill = np.empty((T + 1, N), np.int64)
-    time_left = np.empty((T + 1, N), np.float32)
+    time_left = torch.empty(T + 1, N).numpy()
     is_decision = np.empty((T + 1, N), bool)
 
     act, view, everywhere = policy.skills.actor(), actor_of(policy.filter), np.arange(N)

@@ -80,7 +80,8 @@ class ObservationFilter(RunningMoments):
     """
 
     def _shift_and_scale(self) -> tuple[Tensor, Tensor]:
-        return self.mean.float(), self.variance.sqrt().clamp(min=FILTER_MIN_STD).float()
+        scale = self.variance.sqrt().clamp(min=FILTER_MIN_STD)
+        return self.mean.to(torch.get_default_dtype()), scale.to(torch.get_default_dtype())
 
     def forward(self, x: Tensor) -> Tensor:
         """(..., D) -> (..., D)."""

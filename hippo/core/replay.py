@@ -13,7 +13,8 @@ class Replay:
     def __init__(self, size: int, **shapes: tuple[int, ...]) -> None:
         self.size, self.added = size, 0  # added: rows ever, of which the newest `size` are kept
         # numpy's: torch fills new memory, and so claims it, when algorithms are to be deterministic.
-        self.columns = {name: torch.from_numpy(np.empty((size, *shape), np.float32)) for name, shape in shapes.items()}
+        dtype = torch.zeros(()).numpy().dtype
+        self.columns = {name: torch.from_numpy(np.empty((size, *shape), dtype)) for name, shape in shapes.items()}
 
     def __len__(self) -> int:
         return min(self.added, self.size)
@@ -24,7 +25,7 @@ class Replay:
         count = len(next(iter(rows.values())))
         where = (self.added + torch.arange(count)) % self.size
         for name, values in rows.items():
-            self.columns[name][where] = values.to(torch.float32)
+            self.columns[name][where] = values.to(self.columns[name].dtype)
         self.added += count
 
     def sample(self, count: int, generator: torch.Generator) -> dict[str, Tensor]:
