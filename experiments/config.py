@@ -8,6 +8,7 @@ import hashlib
 import importlib
 import json
 import operator
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import version
@@ -23,6 +24,7 @@ from hydra.errors import HydraException
 from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from experiments import synonyms
 from hippo.core.settings import ConfigError
 from hippo.core.skills import SkillsError, read_skills
 from hippo.envs import ENVIRONMENTS
@@ -41,6 +43,8 @@ ALGORITHMS = {
     "option_critic": ("baselines.option_critic", "OptionCriticConfig"),
     "hiro": ("baselines.hiro", "HiroConfig"),
 }
+# The groups of conf/ that a run chooses from, and what it chooses when nothing is said.
+GROUPS = {"env": "block_hopper", "algo": "hippo", "scale": "paper", "protocol": "paper"}
 BUDGET_FIELDS = ("iterations", "batch_size", "horizon")
 # Names and paths: the text after `key=` is taken as it is typed and never parsed, so it may hold any character.
 PLAIN_TEXT = ("runs_dir", "algo.skills", "wandb.project")
@@ -335,22 +339,24 @@ def compose_run(overrides: Sequence[str], runs_dir: Path | None = None) -> Run:
     Raises:
         ConfigError: an unknown group choice or key, a value of the wrong type or out of range.
     """
-    groups = {"env": "block_hopper", "algo": "hippo", "scale": "paper", "protocol": "paper"}
+    groups = dict(GROUPS)
     names: dict[str, str] = {}
     settings = []
     for text in overrides:
         key, equals, value = text.partition("=")
         if not key or not equals:
             raise ConfigError(key, value, "settings are given as key=value")
+        if not re.fullmatch(r"[\w.]+", key):
+            raise ConfigError(key, value, "a key has letters, _ and dots only, as in algo.learning_rate=1e-3")
         if key in PLAIN_TEXT:
             names[key] = unquoted(value)
         elif key in groups:
-            valid = list(ALGORITHMS) if key == "algo" else choices(key)
-            groups[key] = check_choice(key, str(_parsed(key, text).value()), valid)
+            groups[key] = _check_group(key, str(_parsed(key, text).value()))
         else:
             settings.append(_parsed(key, text))
     if runs_dir is not None:
         names["runs_dir"] = str(runs_dir)
+    _check_reward(groups["env"], groups["algo"])
     config = _base(**groups).copy()
     for override in settings:
         _check_key(config, override.key_or_group, override.value())
@@ -375,10 +381,31 @@ def _parsed(key: str, text: str) -> Override:
     return override
 
 
+def group_choices(group: str) -> list[str]:
+    """The values of env, algo, scale or protocol."""
+    return list(ALGORITHMS) if group == "algo" else choices(group)
+
+
+def _check_group(group: str, value: str) -> str:
+    valid = group_choices(group)
+    if value not in valid and group == "env" and (meant := synonyms.environment(value, valid)):
+        raise ConfigError(group, value, f"did you mean {meant}? valid: {', '.join(valid)}")
+    return check_choice(group, value, valid)
+
+
+def _check_reward(env: str, algo: str) -> None:
+    """Refuse to learn a task where there is none."""
+    if not ENVIRONMENTS[env].pays and algo not in PRETRAINING.values():
+        tasks = [name for name, e in ENVIRONMENTS.items() if e.robot == ENVIRONMENTS[env].robot and e.pays]
+        there = f"the robot alone is paid nothing, algo={PRETRAINING[env]} brings its own reward"
+        raise ConfigError("env", env, f"{there}; did you mean {', '.join(tasks)}?")
+
+
 def _check_key(config: DictConfig, key: str, value: Any) -> None:
     known = sorted(_keys(config))
     if key not in known:
-        raise ConfigError(key, value, f"no such key; {nearest(key, known)}")
+        hint = synonyms.hint(key, [*known, *GROUPS])
+        raise ConfigError(key, value, hint or f"no such key; {nearest(key, known)}")
 
 
 def _keys(node: DictConfig, prefix: str = "") -> Iterator[str]:

@@ -1,16 +1,20 @@
 """What is typed: paths and names of any spelling, words other people use for a key, and what the commands refuse."""
 
+import dataclasses
 import json
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from analysis import claims, report
 from analysis.command_line import SCALES
-from experiments import sweep, train
-from experiments.config import COMMITTED, choices, compose_run
+from experiments import sweep, synonyms, train
+from experiments.config import ALGORITHMS, COMMITTED, GROUPS, PLAIN_TEXT, PRETRAINING, choices, compose_run
 from experiments.plan import make_plan
+from hippo.core.settings import ConfigError
+from hippo.envs import ENVIRONMENTS, make
 from paper_figures import draw
 
 TINY = ["env=block_hopper", "scale=smoke", "iterations=1", "batch_size=200"]
@@ -85,6 +89,64 @@ def test_a_skills_file_and_a_wandb_project_may_hold_any_character(tmp_path):
         compose_run(["algo.skills=it's"])
     with pytest.raises(ValueError, match=r"algo.skills=it's: no such key"):
         compose_run(["algo=ppo", "algo.skills=it's"])
+
+
+# ----------------------------------------------------------------------------------------------------- others' words
+
+MEANT = [
+    (["lr=1e-3"], "lr=0.001: no such key; did you mean algo.learning_rate?"),
+    (["algo.lr=1e-3"], "did you mean algo.learning_rate?"),
+    (["ppo.lr=1e-3"], "did you mean algo.learning_rate?"),
+    (["learning_rate=1e-3"], "did you mean algo.learning_rate?"),
+    (["algo=hiro", "lr=1e-3"], "did you mean algo.actor_learning_rate?"),
+    (["n_steps=2048"], "did you mean batch_size? (environment steps of all"),
+    (["total_timesteps=1e6"], "did you mean iterations? (of batch_size environment steps each)"),
+    (["num_envs=8"], "did you mean batch_size?"),
+    (["algo.n_envs=8"], "did you mean batch_size?"),
+    (["batch=64"], "did you mean batch_size?"),
+    (["gamma=0.9"], "did you mean algo.gamma?"),
+    (["clip_range=0.1"], "did you mean algo.clip_range?"),
+    (["ent_coef=0.1"], "did you mean algo.entropy_weight?"),
+    (["algo=option_critic", "ent_coef=0.1"], "did you mean algo.manager_entropy_weight?"),
+    (["algo=hiro", "ent_coef=0.1"], "it is called algo.entropy_weight, which this learner does not have"),
+    (["n_epochs=4"], "did you mean algo.updates? (passes over the batch"),
+    (["vf_coef=0.5"], "did you mean algo.value_loss_weight?"),
+    (["max-grad-norm=1"], "a key has letters, _ and dots only"),
+    (["--lr=1"], "a key has letters, _ and dots only"),
+    (["env_id=Hopper-v5"], "did you mean env?"),
+    (["env.name=hopper"], "did you mean env?"),
+    (["device=cuda"], "one core of the processor"),
+    (["env=hopper-v5"], "env=hopper-v5: did you mean block_hopper? valid: ant, ant_gather,"),
+    (["env=HalfCheetah-v4"], "did you mean block_half_cheetah?"),
+    (["env=hippo/AntGather-v0"], "did you mean ant_gather?"),
+    (["algo=diayn", "env=Walker2d-v5"], "valid: ant, ant_gather,"),
+    (["env=hopper"], "paid nothing, algo=diayn brings its own reward; did you mean block_hopper?"),
+    (["env=half_cheetah", "algo=ppo"], "did you mean block_half_cheetah?"),
+]
+
+
+@pytest.mark.parametrize(("typed", "said"), MEANT)
+def test_a_word_of_another_library_leads_to_ours(typed, said):
+    with pytest.raises(ConfigError) as refusal:
+        compose_run(typed)
+    assert said in str(refusal.value)
+
+
+def test_every_key_that_a_synonym_leads_to_exists():
+    runs = [compose_run([f"algo={algo}"]) for algo in ALGORITHMS]
+    known = {f"algo.{f.name}" for run in runs for f in dataclasses.fields(run.config)}
+    known |= {*GROUPS, *PLAIN_TEXT, "iterations", "batch_size", "seed", "env.horizon", "wandb.mode"}
+    assert {key for keys in synonyms.KEYS.values() for key in keys} <= known
+    assert synonyms.NOTES.keys() <= known
+
+
+@pytest.mark.parametrize("name", PRETRAINING)
+def test_a_robot_alone_says_whether_it_is_paid(name):
+    envs = make(name, 1, 0)
+    envs.reset(seed=0)
+    _, reward, *_ = envs.step(np.full((1, *envs.single_action_space.shape), 0.5))
+    assert ENVIRONMENTS[name].pays == bool(reward[0])
+    assert compose_run([f"env={name}", f"algo={PRETRAINING[name]}"]).kind == "pretrain"
 
 
 # ---------------------------------------------------------------------------------------------- one check of the scale

@@ -268,7 +268,7 @@ def test_with_nothing_to_report_there_is_one_line_and_exit_code_2(tmp_path, caps
     artefacts.claims(tmp_path)  # claims alone, without a run or a picture, are no report
     assert report.main(arguments(tmp_path)) == 2
     artefacts.picture(tmp_path / "out/smoke/fig1.png", "fig1: x")
-    assert report.main([*arguments(tmp_path), "--scale", "lapto"]) == 2
+    assert report.main([*arguments(tmp_path), "--scale", "paper"]) == 2
     assert "(scales that have something: smoke)" in capsys.readouterr().err
     (tmp_path / "out/laptop").mkdir()
     assert scales(tmp_path / "runs", tmp_path / "out") == ["smoke"]

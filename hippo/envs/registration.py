@@ -10,7 +10,7 @@ import numpy as np
 
 from hippo.envs.blocks import Blocks
 from hippo.envs.gather import Gather
-from hippo.envs.locomote import Locomotion
+from hippo.envs.locomote import SURVIVAL, Locomotion
 from hippo.envs.perturb import PERTURBATIONS, STRENGTHS
 from hippo.envs.robots import ROBOTS
 from hippo.envs.vector import RobotTaskEnv
@@ -40,6 +40,11 @@ class Environment:
     horizon: int  # steps
     revision: int  # bumped when golden trajectories change
     options: dict[str, tuple[Any, ...]]  # option -> valid values
+
+    @property
+    def pays(self) -> bool:
+        """Whether there is any reward."""
+        return self.task is not Locomotion or self.robot in SURVIVAL
 
 
 _SHARED = {"perturbation": (None, *PERTURBATIONS), "strength": STRENGTHS}
