@@ -24,7 +24,7 @@ from experiments import (
     bench_targets,
 )
 from experiments.bench_measure import Row
-from experiments.command_line import Parser, clock, duration
+from experiments.command_line import Parser, clock, duration, run_command
 from experiments.status import write_atomically
 
 
@@ -107,4 +107,4 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run_command(main)

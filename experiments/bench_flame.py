@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from experiments.bench_iterations import Iteration, training
-from experiments.command_line import EXIT_FAILED
+from experiments.command_line import EXIT_FAILED, run_command
 
 PICTURE = Path(__file__).parent.parent / "docs" / "pictures" / "profile_ant_gather.svg"
 TITLE = "One HiPPO iteration, Ant Gather at the paper's batch: share of its wall time by function (py-spy)"
@@ -88,4 +88,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run_command(main)

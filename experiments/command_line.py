@@ -1,8 +1,12 @@
 """What every command line here shares: exit codes, one-line errors and how times are written."""
 
 import argparse
+import signal
 import sys
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NoReturn
+
+from experiments.console import discard
 
 EXIT_FAILED, EXIT_BAD_INPUT, EXIT_DIVERGED, EXIT_NOT_AGREED = 1, 2, 3, 4
 EXIT_REQUEUE = 75  # sysexits' EX_TEMPFAIL
@@ -15,6 +19,25 @@ class Parser(argparse.ArgumentParser):
         """Print the one line and exit."""
         print(f"error: {message}", file=sys.stderr)
         sys.exit(EXIT_BAD_INPUT)
+
+
+def run_command(main: Callable[[], int | None]) -> NoReturn:
+    """Exit with the code of `main`: quietly, too, where nobody reads what it prints (`| head -1`), and at Ctrl-C."""
+    if signal.getsignal(signal.SIGINT) is signal.SIG_DFL:  # experiments/__init__.py; "ignored" stays as it is
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        try:
+            code: Any = main()
+        except SystemExit as end:
+            code = end.code
+        if sys.stdout is not None:  # closed by the caller
+            sys.stdout.flush()
+    except BrokenPipeError:
+        discard(sys.stdout)
+        code = 128 + signal.SIGPIPE
+    except KeyboardInterrupt:
+        code = 128 + signal.SIGINT
+    sys.exit(code)
 
 
 def bad_input(error: Exception) -> int:

@@ -6,12 +6,11 @@ python -m experiments.cost_table --measure    # first renews reference_costs.jso
 
 import json
 import re
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 from experiments import costs
-from experiments.command_line import Parser, duration
+from experiments.command_line import Parser, duration, run_command
 from experiments.config import Run, choices
 from experiments.plan import Plan, make_plan, unique
 from experiments.status import write_atomically
@@ -83,4 +82,4 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run_command(main)

@@ -6,7 +6,6 @@ Every page is docs/environments/<environment>.md; a table stands between `<!-- t
 """
 
 import re
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from experiments.command_line import run_command
 from hippo.envs import ENVIRONMENTS, gymnasium_id, make
 from hippo.envs.perturb import PERTURBATIONS, STRENGTHS, change_of
 from hippo.envs.registration import Options
@@ -139,4 +139,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run_command(main)

@@ -9,7 +9,6 @@ and in every changed environment, so that what differs is the dynamics. Training
 import csv
 import io
 import itertools
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from experiments.command_line import Parser, bad_input
+from experiments.command_line import Parser, bad_input, run_command
 from experiments.config import Run, algorithm
 from experiments.status import write_atomically
 from hippo.core import seeding
@@ -148,4 +147,4 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run_command(main)

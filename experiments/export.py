@@ -7,11 +7,10 @@ folder is a run folder to `experiments.evaluate` and `experiments.video`; traini
 """
 
 import shutil
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from experiments.command_line import Parser, bad_input
+from experiments.command_line import Parser, bad_input, run_command
 from experiments.evaluate import load_run
 from experiments.status import read_status
 from hippo.core import checkpoint
@@ -57,4 +56,4 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run_command(main)

@@ -7,7 +7,6 @@ The same robots, seeds and random actions under both integrators; then one polic
 physics, evaluated under both.
 """
 
-import sys
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from experiments import train
-from experiments.command_line import Parser, bad_input
+from experiments.command_line import Parser, bad_input, run_command
 from experiments.config import Run, compose_run
 from experiments.evaluate import evaluate, load_run
 from hippo.core.checkpoint import CheckpointError
@@ -196,4 +195,4 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run_command(main)

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from baselines.diayn import Discriminator
 from baselines.snn import cells, entropy, log_shares
-from experiments.command_line import EXIT_FAILED, Parser, bad_input, clock
+from experiments.command_line import EXIT_FAILED, Parser, bad_input, clock, run_command
 from experiments.status import write_atomically
 from experiments.video import Recorded, streamed
 from hippo.core import seeding
@@ -322,4 +322,4 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run_command(main)

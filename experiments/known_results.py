@@ -23,6 +23,7 @@ import pandas as pd
 import torch
 
 from baselines import mlsh, option_critic
+from experiments.command_line import run_command
 from hippo.core import seeding
 from hippo.core.checkpoint import Checkpoint
 from hippo.core.log import RunLog
@@ -229,4 +230,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

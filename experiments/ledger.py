@@ -10,6 +10,7 @@ import dataclasses
 import io
 from pathlib import Path
 
+from experiments.command_line import run_command
 from experiments.config import ALGORITHMS, config_class, default_of
 
 DOCS = Path(__file__).parent.parent / "docs"
@@ -66,7 +67,12 @@ def as_markdown() -> str:
     return "\n".join(lines) + "\n"
 
 
-if __name__ == "__main__":
+def main() -> None:
+    """Write both."""
     for path, content in ((DOCS / "hyperparameters.csv", as_csv()), (DOCS / "hyperparameters.md", as_markdown())):
         path.write_text(content)
         print(f"wrote {path}")
+
+
+if __name__ == "__main__":
+    run_command(main)

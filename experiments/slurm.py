@@ -15,6 +15,7 @@ import os
 import shlex
 import shutil
 import subprocess
+import sys
 import time
 import uuid
 from collections.abc import Callable, Iterator, Sequence
@@ -24,13 +25,12 @@ from typing import Any
 
 import submitit
 import yaml
-from filelock import FileLock
 
 from experiments import costs
 from experiments.command_line import duration
 from experiments.config import CONF, Run, nearest
 from experiments.manifest import ROOT, code_version, git
-from experiments.status import read_status, write_atomically
+from experiments.status import locked, read_status, write_atomically
 from experiments.train import execute
 from hippo.core.settings import ConfigError, check, setting
 
@@ -107,7 +107,8 @@ class Job:
 def requeue_unless_cancelled(run: Run) -> None:
     """After the warning signal of a time limit or a pre-emption, ask Slurm for this job again and wait for the end.
 
-    SIGTERM alone is scancel's, or a pre-emption after which Slurm requeues by itself.
+    SIGTERM alone is scancel's, or a pre-emption after which Slurm requeues by itself. Where Slurm cannot be asked, as
+    inside a container without its commands, the job ends and `sweep run` goes on with the run.
     """
     if "SIGUSR" not in read_status(run.folder)["message"]:
         return
@@ -115,7 +116,15 @@ def requeue_unless_cancelled(run: Run) -> None:
     job = environment["SLURM_JOB_ID"]
     if "SLURM_ARRAY_JOB_ID" in environment:
         job = f"{environment['SLURM_ARRAY_JOB_ID']}_{environment['SLURM_ARRAY_TASK_ID']}"
-    subprocess.run(["scontrol", "requeue", job], check=True, timeout=60)
+    try:
+        subprocess.run(["scontrol", "requeue", job], check=True, timeout=60)
+    except (OSError, subprocess.SubprocessError) as error:
+        print(
+            f"not requeued, which needs scontrol here ({error}): {run.run_id} is preempted, `sweep run` continues it",
+            file=sys.stderr,
+            flush=True,
+        )
+        return
     time.sleep(60)  # Slurm ends us; to return now would read as the job's result
 
 
@@ -131,7 +140,7 @@ def submit(runs: Sequence[Run], runs_dir: Path, profile: Profile, dry_run: bool)
         ConfigError: Slurm is not here or refuses.
     """
     folder = runs_dir.absolute() / "slurm"
-    with _private(folder), FileLock(folder / "submit.lock"):
+    with _private(folder), locked(folder / "submit.lock", timeout=-1):
         live = queued(runs_dir)
         todo = [run for run in runs if run.run_id not in live and read_status(run.folder)["state"] != "running"]
         table, size = costs.known(), max_array_size()

@@ -1,24 +1,67 @@
 """status.json of a run: how it is doing, in a file that cannot lie for long."""
 
 import contextlib
+import errno
 import json
+import multiprocessing
 import os
 import signal
 import socket
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from filelock import FileLock, Timeout
+from filelock import FileLock, SoftFileLock, Timeout
 
 from experiments.config import Run, committed_skills
 
 HEARTBEAT_SECONDS = 5.0
 LOST_AFTER_SECONDS = 6 * HEARTBEAT_SECONDS
 DONE = ("finished", "committed")
+SOFT_LOCKS = "HIPPO_SOFT_LOCKS"  # environment variable
+NOT_SUPPORTED = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)  # flock's answers of a file system without locks
+
+
+class NoLocks(OSError):
+    """The folder's file system has no locks, so that two processes could train the same run."""
+
+    def __init__(self, folder: Path, error: OSError) -> None:
+        super().__init__(
+            f"{folder}: its file system has no file locks ({error.strerror}); choose another with runs_dir=FOLDER "
+            f"(--runs-dir FOLDER), or take the risk of {SOFT_LOCKS}=1 (docs/cluster.md)"
+        )
+
+
+@contextlib.contextmanager
+def locked(path: Path, timeout: float = 0.0) -> Iterator[None]:
+    """Hold the lock at `path`; with HIPPO_SOFT_LOCKS=1 one that stands for itself, as path.soft.
+
+    Raises:
+        Timeout: somebody else holds it for longer than `timeout` seconds (negative: for ever).
+        NoLocks: the file system has none.
+    """
+    if os.environ.get(SOFT_LOCKS) == "1":
+        lock: Any = SoftFileLock(path.with_name(f"{path.name}.soft"), timeout=timeout)
+    else:
+        lock = FileLock(path, timeout=timeout, fallback_to_soft=False)
+    try:
+        lock.acquire()
+    except OSError as error:
+        raise NoLocks(path.parent, error) if error.errno in NOT_SUPPORTED else error from None
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+def check_locks(folder: Path) -> None:
+    """Raise NoLocks where runs in `folder` could not be locked."""
+    with tempfile.TemporaryDirectory(dir=folder) as place, locked(Path(place) / ".lock"):
+        pass
 
 
 class Status:
@@ -39,6 +82,7 @@ class Status:
             "started": time.time(),
             "message": "",
         }
+        self.stopped_by = ""  # the signal that ended the run
 
     def update(self, **changes: Any) -> None:
         """Change some entries and write the file."""
@@ -55,14 +99,14 @@ class Status:
 
     @contextlib.contextmanager
     def heartbeat(self) -> Iterator[None]:
-        """Keep the file fresh from a thread, and end this process if the one that started it is gone."""
-        stop, parent = threading.Event(), os.getppid()
+        """Keep the file fresh from a thread; a sweep's worker also ends itself when the sweep is gone."""
+        stop, sweep = threading.Event(), multiprocessing.parent_process()
 
         def beat() -> None:
             while not stop.wait(HEARTBEAT_SECONDS):
                 with contextlib.suppress(OSError):  # a full disk; training itself will say so where it matters
                     self.update()
-                if os.getppid() != parent:
+                if sweep is not None and not sweep.is_alive():
                     os.kill(os.getpid(), signal.SIGTERM)
 
         thread = threading.Thread(target=beat, daemon=True)
@@ -82,6 +126,14 @@ def write_atomically(path: Path, text: str) -> None:
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def remove_abandoned(folder: Path) -> None:
+    """Delete what a process that was killed in `write_atomically` left in `folder`."""
+    for path in folder.glob("*.tmp"):
+        pid = path.suffixes[-2][1:] if len(path.suffixes) > 1 else ""
+        if pid.isdigit() and not Path(f"/proc/{pid}").exists():
+            path.unlink(missing_ok=True)
 
 
 def read_status(folder: Path) -> dict[str, Any]:
@@ -104,7 +156,7 @@ def is_there(run: Run, fresh: bool = False) -> bool:
 
 def mark_lost(run: Run, message: str) -> None:
     """Say in its status.json that the process that trained `run` is gone, unless another has taken the run over."""
-    with contextlib.suppress(Timeout), FileLock(run.folder / ".lock", timeout=0):
+    with contextlib.suppress(Timeout, NoLocks), locked(run.folder / ".lock"):
         status = read_status(run.folder)
         if status["state"] not in ("finished", "diverged"):
             write_atomically(run.folder / "status.json", json.dumps(status | {"state": "lost", "message": message}))

@@ -18,11 +18,12 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from experiments import costs, slurm
-from experiments.command_line import EXIT_FAILED, EXIT_NOT_AGREED, EXIT_REQUEUE, Parser, bad_input, clock
+from experiments.command_line import EXIT_FAILED, EXIT_NOT_AGREED, EXIT_REQUEUE, Parser, bad_input, clock, run_command
 from experiments.config import Run, check_choice, choices
+from experiments.console import unattended
 from experiments.launchers import run_locally
 from experiments.plan import Plan, make_plan, overview, summary, trained_at
-from experiments.status import DONE, read_status
+from experiments.status import DONE, NoLocks, check_locks, read_status
 from hippo.core.settings import ConfigError
 
 LAUNCHERS = ("local", "slurm")
@@ -109,7 +110,8 @@ def run_figure(plan: Plan, todo: Sequence[Run], train: TrainAll, runs_dir: Path)
 
     before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        states = train(todo, report)
+        with unattended():
+            states = train(todo, report)
     except KeyboardInterrupt:
         print("\nstopped; the same command continues where it left off", file=sys.stderr)
         return EXIT_REQUEUE
@@ -237,6 +239,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return ACTIONS[options.action](options, plan_of)
     except ConfigError as error:
         return bad_input(error)
+    except NoLocks as error:
+        print(f"error: {error}", file=sys.stderr)
+        return EXIT_FAILED
 
 
 def check_options(options: argparse.Namespace) -> None:
@@ -300,6 +305,7 @@ def run_or_retry(options: argparse.Namespace, plan_of: Callable[[str], Plan]) ->
     if options.dry_run:
         return 0
     plan.write(options.runs_dir)
+    check_locks(options.runs_dir)
     if profile is None:
         in_order = options.order == "seeds"
         train = functools.partial(train_all, workers=options.workers, in_order=in_order)
@@ -334,4 +340,4 @@ ACTIONS = {
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run_command(main)

@@ -4,8 +4,8 @@
     python -m experiments.train --from-manifest runs/<run_id>/manifest.json [runs_dir=elsewhere]
 
 A run lives in runs/<run_id>/: config.yaml (what it is), manifest.json (where it came from), status.json (how it is
-doing), progress.csv and timing.csv (what it measured), checkpoint.pt and checkpoint.prev.pt; and what it makes:
-skills.pt of a pre-training run, episodes.csv of an evaluation.
+doing), train.log (what it said), progress.csv and timing.csv (what it measured), checkpoint.pt and checkpoint.prev.pt;
+and what it makes: skills.pt of a pre-training run, episodes.csv of an evaluation.
 """
 
 import contextlib
@@ -21,13 +21,22 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from filelock import FileLock, Timeout
+from filelock import Timeout
 
-from experiments.command_line import EXIT_DIVERGED, EXIT_FAILED, EXIT_REQUEUE, bad_input, clock
+from experiments.command_line import EXIT_DIVERGED, EXIT_FAILED, EXIT_REQUEUE, bad_input, clock, run_command
 from experiments.config import PRETRAINED, Run, algorithm, committed_skills, compose_run, unquoted
+from experiments.console import unattended
 from experiments.evaluate import as_csv, evaluate_all
 from experiments.manifest import from_manifest, manifest_with_history
-from experiments.status import HEARTBEAT_SECONDS, Status, is_there, read_status, write_atomically
+from experiments.status import (
+    HEARTBEAT_SECONDS,
+    Status,
+    is_there,
+    locked,
+    read_status,
+    remove_abandoned,
+    write_atomically,
+)
 from hippo import gradients
 from hippo.core import checkpoint, seeding
 from hippo.core.checkpoint import Checkpoint, CheckpointError
@@ -52,14 +61,19 @@ def execute(run: Run) -> str:
     parent = run.parent
     if parent is not None and not is_there(parent) and (state := _finish_parent(parent)) != "finished":
         return "preempted" if state == "preempted" else "failed"
-    run.folder.mkdir(parents=True, exist_ok=True)
     try:
-        with FileLock(run.folder / ".lock", timeout=0):
+        run.folder.mkdir(parents=True, exist_ok=True)
+        with locked(run.folder / ".lock"), unattended(run.folder / "train.log"):
             return _execute_locked(run)
     except Timeout:
         status = read_status(run.folder)
-        print(f"{run.run_id} is already running (host {status.get('host')}, pid {status.get('pid')})")
+        soft = run.folder / ".lock.soft"
+        stale = f"; if it is not, delete {soft}" if status["state"] != "running" and soft.exists() else ""
+        print(f"{run.run_id} is already running (host {status.get('host')}, pid {status.get('pid')}){stale}")
         return "running"
+    except OSError as error:
+        print(f"error: {run.run_id} cannot start: {error}", file=sys.stderr)
+        return "failed"
 
 
 def what_next(run: Run) -> str:
@@ -85,46 +99,68 @@ def _finish_parent(parent: Run) -> str:
 def _execute_locked(run: Run) -> str:
     if read_status(run.folder)["state"] == "finished":  # by whoever held the lock before
         return "finished"
+    remove_abandoned(run.folder)
+    write_atomically(run.folder / "config.yaml", run.to_yaml())
+    write_atomically(run.folder / "manifest.json", json.dumps(manifest_with_history(run), indent=1))
+    status = Status(run)
+    status.update()
     try:
-        write_atomically(run.folder / "config.yaml", run.to_yaml())
-        write_atomically(run.folder / "manifest.json", json.dumps(manifest_with_history(run), indent=1))
-        status = Status(run)
-        status.update()
-    except OSError as error:
-        print(f"error: {run.run_id} cannot start: {error}", file=sys.stderr)
-        return "failed"
-    with _preemption(), status.heartbeat(), mirrored(run.folder, run.wandb_mode, run.wandb_project):
-        try:
-            WORK[run.kind](run, status)
-            status.update(state="finished", message="")
-            print(what_next(run), flush=True)
-        except Diverged as error:
-            checkpoint.save(run.folder / "diverged.pt", error.dump)
-            status.end("diverged", str(error))
-            print(f"diverged: {error}", file=sys.stderr)
-        except (Preempted, KeyboardInterrupt) as error:
-            status.end("preempted", f"stopped by {error or 'Ctrl-C'}; start it again to continue")
-        except (OSError, MemoryError) as error:  # the machine's fault, so `retry` may try again
-            message = f"{error or type(error).__name__}; start it again to continue from the last checkpoint"
-            status.end("failed", message, cause="infrastructure")
-            print(f"error: {message}", file=sys.stderr)
-        except (CheckpointError, SkillsError) as error:
-            status.end("failed", str(error), cause="error")
-            print(f"error: {error}", file=sys.stderr)
-        except Exception as error:
-            status.end("failed", f"{type(error).__name__}: {error}".splitlines()[0], cause="error")
-            traceback.print_exc()
+        with _preemption(status), status.heartbeat(), mirrored(run.folder, run.wandb_mode, run.wandb_project):
+            _work(run, status)
+    except Preempted:  # between the lines of `_work`, or while it ended
+        _stopped(status)
     return status.content["state"]
 
 
+def _work(run: Run, status: Status) -> None:
+    """Do the run; its last status and line say how that ended."""
+    try:
+        WORK[run.kind](run, status)
+        status.update(state="finished", message="")
+        print(what_next(run), flush=True)
+    except Diverged as error:
+        checkpoint.save(run.folder / "diverged.pt", error.dump)
+        status.end("diverged", str(error))
+        print(f"diverged: {error}", file=sys.stderr)
+    except Preempted:
+        _stopped(status)
+    except (OSError, MemoryError) as error:  # the machine's fault, so `retry` may try again
+        message = f"{error or type(error).__name__}; start it again to continue from the last checkpoint"
+        status.end("failed", message, cause="infrastructure")
+        print(f"error: {message}", file=sys.stderr)
+    except (CheckpointError, SkillsError) as error:
+        status.end("failed", str(error), cause="error")
+        print(f"error: {error}", file=sys.stderr)
+    except Exception as error:
+        status.end("failed", f"{type(error).__name__}: {error}".splitlines()[0], cause="error")
+        traceback.print_exc()
+
+
+def _stopped(status: Status) -> None:
+    """Say which signal stopped the run, if it had not ended by itself."""
+    if status.content["state"] == "running":
+        message = f"stopped by {status.stopped_by}; start it again to continue"
+        status.end("preempted", message)
+        print(f"preempted: {message}", file=sys.stderr)
+
+
 @contextlib.contextmanager
-def _preemption() -> Iterator[None]:
-    """Turn SIGTERM, SIGUSR1 and SIGUSR2 (submitit's) into Preempted while the block runs."""
+def _preemption(status: Status) -> Iterator[None]:
+    """Turn the first of Ctrl-C, SIGTERM, SIGUSR1 and SIGUSR2 (submitit's) into Preempted while the block runs.
+
+    Those that follow must not interrupt the end of the run. A worker of a sweep and a job in the background of a shell
+    ignore Ctrl-C already, and go on to.
+    """
 
     def stop(number: int, frame: object) -> None:
-        raise Preempted(signal.Signals(number).name)
+        if not status.stopped_by:
+            status.stopped_by = signal.Signals(number).name
+            raise Preempted
 
-    before = {number: signal.signal(number, stop) for number in (signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2)}
+    numbers = [signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2]
+    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
+        numbers.append(signal.SIGINT)
+    before = {number: signal.signal(number, stop) for number in numbers}
     try:
         yield
     finally:
@@ -164,6 +200,8 @@ def train(run: Run, status: Status) -> None:
 
     def on_row(metrics: Row, timing: Row) -> None:
         nonlocal first
+        if status.stopped_by:  # an exception raised inside a finaliser is lost; the word is not
+            raise Preempted
         done = int(metrics["iteration"]) + 1
         first = done - 1 if first is None else first
         eta = (time.monotonic() - started) / (done - first) * (run.config.iterations - done)
@@ -238,4 +276,4 @@ def _from_manifest(arguments: list[str]) -> Run:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run_command(main)

@@ -16,7 +16,7 @@ import imageio.v2 as imageio
 import numpy as np
 import torch
 
-from experiments.command_line import EXIT_FAILED, Parser, bad_input, clock
+from experiments.command_line import EXIT_FAILED, Parser, bad_input, clock, run_command
 from experiments.config import Run, algorithm
 from experiments.evaluate import environments, load_run
 from hippo.core import seeding
@@ -118,4 +118,4 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run_command(main)

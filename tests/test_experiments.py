@@ -211,7 +211,7 @@ def test_a_signalled_run_continues_to_the_same_bytes(name, tmp_path):
 def test_a_second_launch_of_a_running_run_leaves_it_alone(tmp_path, capsys):
     run = compose_run([*TINY, f"runs_dir={tmp_path}"])
     run.folder.mkdir()
-    with train.FileLock(run.folder / ".lock"):
+    with train.locked(run.folder / ".lock"):
         Status(run).update()
         assert train.execute(run) == "running"
     assert f"already running (host {socket.gethostname()}, pid {os.getpid()})" in capsys.readouterr().out

@@ -175,7 +175,7 @@ def test_a_lost_process_leaves_its_cause_unless_the_run_was_taken_over_or_is_don
 
     tiny_run.folder.mkdir(exist_ok=True)
     Status(tiny_run).update()
-    with train.FileLock(tiny_run.folder / ".lock"):  # another process trains it
+    with train.locked(tiny_run.folder / ".lock"):  # another process trains it
         mark_lost(tiny_run, "killed")
     assert state() == "running"
     mark_lost(tiny_run, f"its process ended: {launchers.cause(-signal.SIGKILL)}")
