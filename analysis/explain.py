@@ -1,12 +1,19 @@
-"""The runs behind a figure or table: `python -m analysis.explain paper_figures/out/laptop/fig3.pdf`."""
+"""The runs behind a figure or table, or what one run is.
+
+python -m analysis.explain paper_figures/out/laptop/fig3.pdf
+python -m analysis.explain runs/<run_id>
+"""
 
 import argparse
+import csv
 import json
 import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
+
+import yaml
 
 STATED = re.compile(rb"(\d+) runs, set [0-9a-f]{12}: ((?:[0-9a-f]{12} ?)+)")
 
@@ -33,11 +40,55 @@ def run_ids(path: Path) -> list[str]:
     return ids
 
 
+def plans(runs_dir: Path) -> list[dict[str, Any]]:
+    """Every plan that was written in `runs_dir`."""
+    return [json.loads(path.read_text()) for path in sorted((runs_dir / "plans").glob("*/*.json"))]
+
+
+def describe_run(folder: Path) -> list[str]:
+    """What the run in `folder` is, how it is doing, the code it comes from and the figures that show it.
+
+    Raises:
+        ValueError: it is no run's folder.
+    """
+    try:
+        manifest = json.loads((folder / "manifest.json").read_text())
+        identity, run = manifest["identity"], yaml.safe_load(manifest["config"])
+        parts = (f"{run['kind']} {identity['env']} {identity['algo']}", f"seed {identity['seed']}")
+        size = f"{identity['iterations']} iterations of {identity['batch_size']} steps"
+    except (OSError, ValueError, KeyError, TypeError, yaml.YAMLError) as error:
+        raise ValueError(f"{folder}: is no run folder: it has no readable manifest.json") from error
+    changed = identity["settings"] | identity["options"]
+    lines = [
+        "  ".join(
+            [manifest["run_id"], *parts, f"scale {run['scale']}", f"protocol {run.get('protocol', 'paper')}", size]
+        ),
+        f"settings: {'  '.join(f'{key}={value}' for key, value in changed.items()) or 'all at their default'}",
+    ]
+    if manifest.get("parent"):
+        lines.append(f"needs: {folder.parent / manifest['parent']}")
+    if (folder / "status.json").exists():
+        status = json.loads((folder / "status.json").read_text())
+        lines.append(f"{status['state']} at iteration {status['iteration'] + 1}  {status['message']}".rstrip())
+    if (folder / "progress.csv").exists():
+        rows = list(csv.DictReader((folder / "progress.csv").read_text().splitlines()))
+        if rows and "return_mean" in rows[-1]:
+            lines.append(f"return of the last iteration: {float(rows[-1]['return_mean']):.3f}")
+    lines.append(f"commit {manifest['git_commit']}{' and changes to it' if manifest['git_difference'] else ''}")
+    shown = [
+        f"{plan['figure']} at scale {plan['scale']} as {of['variant']}"
+        for plan in plans(folder.parent)
+        for of in plan["runs"]
+        if of["run_id"] == manifest["run_id"]
+    ]
+    lines.append(f"in {', '.join(shown)}" if shown else f"in no plan of {folder.parent}")
+    return lines
+
+
 def describe(ids: Sequence[str], runs_dir: Path) -> list[str]:
     """A line per run: what it is, from the plans, and the commit it was trained at, where its folder is here."""
     planned: dict[str, tuple[str, dict[str, Any]]] = {}
-    for path in sorted((runs_dir / "plans").glob("*/*.json")):
-        plan = json.loads(path.read_text())
+    for plan in plans(runs_dir):
         planned |= {run["run_id"]: (plan["scale"], run) for run in plan["runs"]}
     lines = []
     for run_id in ids:
@@ -57,10 +108,13 @@ def describe(ids: Sequence[str], runs_dir: Path) -> list[str]:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Print the runs."""
     parser = argparse.ArgumentParser(prog="analysis.explain", description=__doc__.splitlines()[0])
-    parser.add_argument("file", type=Path)
+    parser.add_argument("file", type=Path, help="a figure, a table or their csv; or a run folder")
     parser.add_argument("--runs-dir", type=Path, default=Path("runs"))
     options = parser.parse_args(arguments)
     try:
+        if options.file.is_dir():
+            print("\n".join(describe_run(options.file)))
+            return 0
         ids = run_ids(options.file)
     except ValueError as error:
         print(f"error: {error}", file=sys.stderr)

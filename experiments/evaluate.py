@@ -1,4 +1,4 @@
-"""Evaluate a trained policy, also under changed dynamics, without learning: a csv with a row per episode.
+"""Evaluate a trained policy, also under changed dynamics, without learning: its mean return, or a row per episode.
 
     python -m experiments.evaluate runs/<run_id> --perturbation mass --episodes 25 --out mass.csv
 
@@ -9,12 +9,14 @@ and in every changed environment, so that what differs is the dynamics. Training
 import csv
 import io
 import itertools
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from scipy import stats
 
 from experiments.command_line import Parser, bad_input, run_command
 from experiments.config import Run, algorithm
@@ -119,6 +121,40 @@ def as_csv(rows: Sequence[dict[str, Any]]) -> str:
     return text.getvalue()
 
 
+def summary(rows: Sequence[dict[str, Any]]) -> str:
+    """What a person reads: a line per environment, with the mean return and its 95 % interval over episodes."""
+    columns = f"{'environment':18} {'perturbation':12} {'strength':8} {'episodes':>8}"
+    lines = [f"{columns}  {'mean return':>11}  {'95 % interval':>19}  {'mean length':>11}"]
+    for key, group in itertools.groupby(rows, lambda row: (row["env"], row["perturbation"], row["strength"])):
+        env, perturbation, strength = key
+        episodes = list(group)
+        returns = np.array([row["return"] for row in episodes])
+        low, high = interval(returns)
+        between = f"{low:.3f} to {high:.3f}" if len(returns) > 1 else "none of one"
+        cells = f"{env:18} {perturbation:12} {'' if perturbation == 'none' else strength:8} {len(returns):8}"
+        length = np.mean([row["length"] for row in episodes])
+        lines.append(f"{cells}  {returns.mean():11.3f}  {between:>19}  {length:11.1f}")
+    return "\n".join(lines)
+
+
+def interval(returns: np.ndarray) -> tuple[float, float]:
+    """Student's 95 % interval of the mean of (n,) returns; of equal ones, and of a single one, a point."""
+    mean, error = returns.mean(), returns.std(ddof=1) / len(returns) ** 0.5 if len(returns) > 1 else 0.0
+    half = error * stats.t.ppf(0.975, len(returns) - 1) if error else 0.0
+    return mean - half, mean + half
+
+
+FLAGS = {"perturbation": "--perturbation", "strength": "--strength", "num_envs": "--episodes"}
+
+
+def in_flags(error: ConfigError) -> ConfigError:
+    """`error` with the environment's options as the flags to type: `strength=all` as `--strength all`."""
+    if error.key not in FLAGS:
+        return error
+    valid = re.sub(rf"\b({'|'.join(FLAGS)})=", lambda match: f"{FLAGS[match[1]]} ", error.valid)
+    return ConfigError(FLAGS[error.key], error.value, valid)
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Evaluate from the command line."""
     parser = Parser(prog="experiments.evaluate", description=__doc__.splitlines()[0])
@@ -128,21 +164,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--episodes", type=int, default=25, help="the paper's 25 (Table 1)")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--greedy", action="store_true", help="most likely choices instead of samples")
-    parser.add_argument("--out", type=Path, help="csv to write instead of printing it")
+    parser.add_argument("--csv", action="store_true", help="print a row per episode instead of the summary")
+    parser.add_argument("--out", type=Path, help="csv to write, a row per episode")
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
     try:
         run = load_run(options.run)
         changes = {"perturbation": options.perturbation, "strength": options.strength}
         rows = evaluate(run, options.episodes, options.seed, options.greedy, **changes)
-    except (ConfigError, CheckpointError) as error:
+    except ConfigError as error:
+        return bad_input(in_flags(error))
+    except CheckpointError as error:
         return bad_input(error)
-    returns = np.array([row["return"] for row in rows])
-    if options.out is None:
-        print(as_csv(rows), end="")
-    else:
+    if options.out is not None:
         write_atomically(options.out, as_csv(rows))
-        print(f"{len(rows)} episodes, mean return {returns.mean():.3f}, std {returns.std():.3f}: {options.out}")
+    print(as_csv(rows).rstrip("\n") if options.csv else summary(rows))
     return 0
 
 

@@ -18,7 +18,7 @@ import torch
 
 from experiments.command_line import EXIT_FAILED, Parser, bad_input, clock, run_command
 from experiments.config import Run, algorithm
-from experiments.evaluate import environments, load_run
+from experiments.evaluate import environments, in_flags, load_run
 from hippo.core import seeding
 from hippo.core.checkpoint import Checkpoint, CheckpointError
 from hippo.core.settings import ConfigError
@@ -108,7 +108,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise ConfigError("seed", options.seed, "must be at least 0")
         changes = {"perturbation": options.perturbation, "strength": options.strength}
         total = record(run, path, options.seed, options.greedy, **changes)
-    except (ConfigError, CheckpointError) as error:
+    except ConfigError as error:
+        return bad_input(in_flags(error))
+    except CheckpointError as error:
         return bad_input(error)
     except NoOpenGL as error:
         print(f"error: {error}", file=sys.stderr)

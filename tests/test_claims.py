@@ -254,6 +254,32 @@ def test_the_runs_behind_a_picture_are_listed(tmp_path, capsys):
     assert explain.run_ids(tmp_path / "table.tex") == ["0123456789ab", "ba9876543210"]
 
 
+def test_a_run_folder_is_explained(tmp_path, capsys):
+    planned(tmp_path, [3, 2])
+    folder = tmp_path / f"{0:012x}"
+    identity = {"algo": "ppo", "env": "block_hopper", "seed": 3, "iterations": 3, "batch_size": 10}
+    identity |= {"settings": {"gamma": 0.9}, "options": {"physics": "fast"}}
+    config = "kind: train\nscale: smoke\nprotocol: modern\n"
+    manifest = {"run_id": folder.name, "identity": identity, "config": config, "parent": "ba9876543210"}
+    code = {"git_commit": "c0ffee", "git_difference": "a digest"}
+    (folder / "manifest.json").write_text(json.dumps(manifest | code))
+    (folder / "status.json").write_text(json.dumps({"state": "preempted", "iteration": 2, "message": "by SIGINT"}))
+    assert explain.main([str(folder)]) == 0
+    assert capsys.readouterr().out.splitlines() == [
+        "000000000000  train block_hopper ppo  seed 3  scale smoke  protocol modern  3 iterations of 10 steps",
+        "settings: gamma=0.9  physics=fast",
+        f"needs: {tmp_path / 'ba9876543210'}",
+        "preempted at iteration 3  by SIGINT",
+        "return of the last iteration: 0.200",
+        "commit c0ffee and changes to it",
+        "in fig3 at scale smoke as ppo",
+    ]
+    for content in ("", "[]", json.dumps({"run_id": folder.name})):
+        (folder / "manifest.json").write_text(content)
+        assert explain.main([str(folder)]) == 2
+        assert capsys.readouterr().err == f"error: {folder}: is no run folder: it has no readable manifest.json\n"
+
+
 def test_a_file_without_provenance_is_refused(tmp_path, capsys):
     (tmp_path / "x.png").write_bytes(b"nothing")
     assert explain.main([str(tmp_path / "x.png")]) == 2

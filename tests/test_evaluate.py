@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from baselines import ppo
-from experiments import evaluate, export, train
+from experiments import evaluate, export, train, video
 from experiments.config import compose_run
 from hippo.core.episodes import opening_episodes
 from hippo.core.hierarchy import HierarchicalPolicy, collect
@@ -92,12 +92,45 @@ def test_the_command_line_writes_a_csv_or_refuses(trained, tmp_path, capsys):
     capsys.readouterr()
     for arguments, message in (
         ([str(tmp_path)], "is no run folder"),
-        ([str(run.folder), "--perturbation", "wind"], "perturbation=wind"),
-        ([str(run.folder), "--episodes", "0"], "num_envs=0"),
+        ([str(run.folder), "--perturbation", "wind"], "--perturbation=wind: "),
+        ([str(run.folder), "--episodes", "0"], "--episodes=0: "),
     ):
         assert evaluate.main([*arguments, "--out", str(tmp_path / "no.csv")]) == 2
         assert message in capsys.readouterr().err
         assert not (tmp_path / "no.csv").exists()
+
+
+def test_the_terminal_shows_a_summary_and_the_rows_only_when_asked(trained, capsys):
+    folder = str(trained["ppo"].folder)
+    assert evaluate.main([folder, "--episodes", "3", "--perturbation", "mass"]) == 0
+    header, line = capsys.readouterr().out.splitlines()
+    rows = evaluate.evaluate(trained["ppo"], 3, 0, perturbation="mass")
+    low, high = evaluate.interval(np.array(returns(rows)))
+    assert " ".join(header.split()).endswith("strength episodes mean return 95 % interval mean length")
+    assert line.split()[:4] == ["snake_gather", "mass", "original", "3"]
+    assert line.split()[4:8] == [f"{np.mean(returns(rows)):.3f}", f"{low:.3f}", "to", f"{high:.3f}"]
+    assert evaluate.main([folder, "--episodes", "3", "--perturbation", "mass", "--csv"]) == 0
+    assert capsys.readouterr().out == evaluate.as_csv(rows)
+
+
+def test_the_interval_worked_by_hand():
+    # 1, 2, 3: mean 2, standard deviation 1, standard error 1 / sqrt 3; Student's 97.5 % point of 2 degrees is 4.3027.
+    assert evaluate.interval(np.array([1.0, 2.0, 3.0])) == pytest.approx(
+        (2 - 4.3027 / 3**0.5, 2 + 4.3027 / 3**0.5), 1e-4
+    )
+    assert evaluate.interval(np.array([5.0, 5.0])) == evaluate.interval(np.array([5.0])) == (5.0, 5.0)
+
+
+def test_what_a_robot_cannot_have_names_the_flag_to_type(tmp_path, capsys):
+    hopper = compose_run(["env=block_hopper", "algo=ppo", "scale=smoke", "iterations=1", f"runs_dir={tmp_path}"])
+    hopper.folder.mkdir()
+    (hopper.folder / "config.yaml").write_text(hopper.to_yaml())
+    (hopper.folder / "checkpoint.pt").touch()
+    for command in (evaluate, video):
+        assert command.main([str(hopper.folder), "--perturbation", "mass"]) == 2
+        error = capsys.readouterr().err
+        assert error.startswith("error: --strength=original: ")
+        assert error.endswith("use --strength all\n")
 
 
 @pytest.mark.parametrize("algo", ["hippo", "ppo", "hier_vpg"])
