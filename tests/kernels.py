@@ -3,6 +3,8 @@
 Libraries choose when they are loaded, by variables of the environment; the first line printed is what they chose.
 """
 
+import experiments  # noqa: F401, I001  first: one thread, as when training
+
 import contextlib
 import ctypes
 import json
@@ -16,7 +18,6 @@ import scipy.linalg  # noqa: F401  brings the BLAS that numba's np.dot calls
 import torch
 from numba.core.registry import cpu_target
 
-import experiments  # noqa: F401  first: one thread, as when training
 
 CORE = ("scipy_openblas_get_corename64_", "scipy_openblas_get_corename", "openblas_get_corename")
 
