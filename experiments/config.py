@@ -25,7 +25,7 @@ from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from experiments import synonyms
-from hippo.core.settings import ConfigError
+from hippo.core.settings import ConfigError, setting
 from hippo.core.skills import SkillsError, read_skills
 from hippo.envs import ENVIRONMENTS
 from hippo.envs.registration import Options, check_option
@@ -118,8 +118,8 @@ class Protocol:
 class WandbConfig:
     """The mirror to Weights & Biases."""
 
-    mode: str = "disabled"
-    project: str = "hippo"
+    mode: str = setting("disabled", "whether and how the run is mirrored (docs/wandb.md)", choices=WANDB_MODES)
+    project: str = setting("hippo", "where it is mirrored to")
 
 
 @dataclass
@@ -129,11 +129,11 @@ class RunSchema:
     env: EnvConfig = MISSING
     algo: Any = MISSING
     scale: str = MISSING
-    seed: int = MISSING
+    seed: int = setting(MISSING, "root of every random stream; at least 0 and below 2**32")
     seeds: int = MISSING
     iterations: int = MISSING
     batch_size: int = MISSING
-    runs_dir: str = MISSING
+    runs_dir: str = setting(MISSING, "the folder in which the run makes its own")
     budget: dict[str, Budget] = field(default_factory=dict)
     off_policy: OffPolicyBudget = field(default_factory=OffPolicyBudget)
     protocol: Protocol = field(default_factory=Protocol)
@@ -426,14 +426,18 @@ def _as_config_error(key: str, value: Any) -> Iterator[None]:
         raise ConfigError(key, value, str(error).splitlines()[0]) from error
 
 
+def level_of(name: str) -> str:
+    """Where a setting of an algorithm stands in the whole configuration."""
+    return {"iterations": "", "batch_size": "", "horizon": "env."}.get(name, "algo.")
+
+
 @contextlib.contextmanager
 def _of_algo() -> Iterator[None]:
     """Name a setting that an algorithm refuses by its key in the whole configuration."""
     try:
         yield
     except ConfigError as error:
-        level = {"iterations": "", "batch_size": "", "horizon": "env."}.get(error.key, "algo.")
-        raise ConfigError(f"{level}{error.key}", error.value, error.valid) from error
+        raise ConfigError(f"{level_of(error.key)}{error.key}", error.value, error.valid) from error
 
 
 def _check_skills(path: str, env: dict[str, Any], settings: dict[str, Any]) -> None:

@@ -2,12 +2,15 @@
 
     python -m experiments.train algo=hippo env=ant_gather seed=3 algo.period_min=5
     python -m experiments.train --from-manifest runs/<run_id>/manifest.json [runs_dir=elsewhere]
+    python -m experiments.train algo=ppo env=ant_gather --help    # every key of this learner and this environment
+    python -m experiments.train algo=ppo env=ant_gather --cfg     # the run as yaml; nothing is trained
 
 A run lives in runs/<run_id>/: config.yaml (what it is), manifest.json (where it came from), status.json (how it is
 doing), train.log (what it said), progress.csv and timing.csv (what it measured), checkpoint.pt and checkpoint.prev.pt;
 and what it makes: skills.pt of a pre-training run, episodes.csv of an evaluation.
 """
 
+import argparse
 import contextlib
 import dataclasses
 import json
@@ -23,7 +26,8 @@ from typing import Any
 import torch
 from filelock import Timeout
 
-from experiments.command_line import EXIT_DIVERGED, EXIT_FAILED, EXIT_REQUEUE, bad_input, clock, run_command
+from experiments import usage
+from experiments.command_line import EXIT_DIVERGED, EXIT_FAILED, EXIT_REQUEUE, Parser, bad_input, clock, run_command
 from experiments.config import PRETRAINED, Run, algorithm, committed_skills, compose_run, unquoted
 from experiments.console import unattended
 from experiments.evaluate import as_csv, evaluate_all
@@ -254,25 +258,45 @@ def measure(run: Run, status: Status) -> None:
 WORK = {"train": train, "pretrain": pretrain, "evaluate": evaluate, "measure": measure}
 
 
+def parse(arguments: list[str] | None) -> argparse.Namespace:
+    """The command line: settings and a few flags, some of them Hydra's."""
+    parser = Parser(prog="experiments.train", add_help=False, allow_abbrev=False)
+    parser.add_argument("settings", nargs="*")
+    parser.add_argument("-h", "--help", action="store_true")
+    parser.add_argument("-c", "--cfg", action="store_true")
+    parser.add_argument("-m", "--multirun", action="store_true")
+    parser.add_argument("--from-manifest", type=Path)
+    options = parser.parse_intermixed_args(arguments)
+    if options.multirun:
+        parser.error("--multirun: one command, one run; loop over it in the shell, or see experiments.sweep --help")
+    if options.cfg and "job" in options.settings:  # Hydra's way to say it
+        options.settings.remove("job")
+    return options
+
+
 def main(arguments: list[str] | None = None) -> int:
-    """Train one run; the exit code says how it ended."""
-    arguments = sys.argv[1:] if arguments is None else arguments
-    if {"-h", "--help"} & set(arguments):
-        print(__doc__)
-        return 0
+    """Train one run, or say what it would be; the exit code says how it ended."""
+    options = parse(arguments)
     try:
-        run = _from_manifest(arguments) if arguments[:1] == ["--from-manifest"] else compose_run(arguments)
+        run = _from_manifest(options) if options.from_manifest else compose_run(options.settings)
     except ConfigError as error:
         return bad_input(error)
+    if options.help:
+        print(__doc__, usage.text(run), sep="")
+        return 0
+    if options.cfg:
+        print(f"# {run.folder}\n{run.to_yaml()}", end="")
+        return 0
     return EXIT_CODES[execute(run)]
 
 
-def _from_manifest(arguments: list[str]) -> Run:
+def _from_manifest(options: argparse.Namespace) -> Run:
     """The run of `--from-manifest FILE [runs_dir=FOLDER]`."""
-    path, settings = arguments[1:2], arguments[2:]
-    if not path or len(settings) > 1 or not all(s.startswith("runs_dir=") for s in settings):
-        raise ConfigError("from-manifest", " ".join(arguments[1:]), "takes a manifest.json and at most runs_dir=FOLDER")
-    return from_manifest(Path(path[0]), Path(unquoted(settings[0].removeprefix("runs_dir=")) if settings else "runs"))
+    key, _, folder = (options.settings or ["runs_dir=runs"])[0].partition("=")
+    if len(options.settings) > 1 or key != "runs_dir" or not unquoted(folder):
+        taken = shlex.join([str(options.from_manifest), *options.settings])
+        raise ConfigError("from-manifest", taken, "takes a manifest.json and at most runs_dir=FOLDER")
+    return from_manifest(options.from_manifest, Path(unquoted(folder)))
 
 
 if __name__ == "__main__":

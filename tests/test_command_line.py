@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -11,7 +12,17 @@ import pytest
 from analysis import claims, report
 from analysis.command_line import SCALES
 from experiments import sweep, synonyms, train
-from experiments.config import ALGORITHMS, COMMITTED, GROUPS, PLAIN_TEXT, PRETRAINING, choices, compose_run
+from experiments.config import (
+    ALGORITHMS,
+    BUDGET_FIELDS,
+    COMMITTED,
+    GROUPS,
+    PLAIN_TEXT,
+    PRETRAINING,
+    Run,
+    choices,
+    compose_run,
+)
 from experiments.plan import make_plan
 from hippo.core.settings import ConfigError
 from hippo.envs import ENVIRONMENTS, make
@@ -36,6 +47,20 @@ FOLDERS = [
     "~x",
     " outer spaces ",
 ]
+
+
+def refused(main, arguments, capsys):
+    """What `main` says about arguments that it must refuse: at most three lines, exit code 2."""
+    try:
+        code = main(arguments)
+    except SystemExit as exit:
+        code = exit.code
+    said = capsys.readouterr()
+    assert code == 2
+    assert not said.out
+    assert said.err.count("\n") <= 3
+    return said.err
+
 
 # ---------------------------------------------------------------------------------------------------- paths and names
 
@@ -149,20 +174,62 @@ def test_a_robot_alone_says_whether_it_is_paid(name):
     assert compose_run([f"env={name}", f"algo={PRETRAINING[name]}"]).kind == "pretrain"
 
 
+# -------------------------------------------------------------------------------------------------- help and yaml
+
+
+CHOSEN = {"hiro": "ant_gather", "diayn": "hopper"}  # algorithm -> environment, where not every one will do
+
+
+@pytest.mark.parametrize("algo", ALGORITHMS)
+def test_help_lists_every_key_with_a_value_that_may_be_typed_and_its_meaning(algo, capsys):
+    chosen = [f"algo={algo}", f"env={CHOSEN.get(algo, 'snake_gather')}", "scale=laptop"]
+    assert train.main([*chosen, "--help"]) == 0
+    said = re.findall(r"^  ([\w.]+)=(\S*) {2,}(\S.*)$", capsys.readouterr().out, re.MULTILINE)
+    run = compose_run(chosen)
+    settings = {f"algo.{f.name}" for f in dataclasses.fields(run.config)} - {f"algo.{name}" for name in BUDGET_FIELDS}
+    options = {f"env.{name}" for name in ENVIRONMENTS[run.env].options}
+    others = {"env.horizon", "iterations", "batch_size", "seed", "runs_dir", "wandb.mode", "wandb.project"}
+    assert {key for key, *_ in said} == settings | options | others | GROUPS.keys()
+    assert compose_run([f"{key}={value}" for key, value, _ in said]) == run  # the values are those of the run
+
+
+def test_help_is_about_the_chosen_protocol_and_names_choices_and_ranges(capsys):
+    assert train.main(["--help", "protocol=modern", "algo.gamma=0.9"]) == 0
+    said = capsys.readouterr().out
+    assert re.search(r"algo.minibatch_size=256 +environment steps per gradient step; .*at least 0\n", said)
+    assert re.search(r"algo.gamma=0.9 +discount per environment step; above 0.0; at most 1.0\n", said)
+    assert re.search(r"env=block_hopper +one of ant, ant_gather, ", said)
+    assert re.search(r"seed=0 +root of every random stream", said)
+
+
+@pytest.mark.parametrize("flags", [["--cfg"], ["--cfg", "job"], ["-c", "job"]])
+def test_cfg_prints_the_composed_run_and_trains_nothing(flags, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert train.main([*flags, *TINY, "algo.gamma=0.9"]) == 0
+    said = capsys.readouterr().out
+    run = compose_run([*TINY, "algo.gamma=0.9"])
+    assert said.startswith(f"# {run.folder}\n")
+    assert Run.from_yaml(said, run.runs_dir) == run
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["-m", "seed=1,2"], "error: --multirun: one command, one run; loop over it in the shell, or see"),
+        (["--multirun"], "experiments.sweep"),
+        (["--lr=1e-3"], "--lr=1e-3"),
+        (["--from-manifest"], "--from-manifest"),
+        (["--from-manifest", "manifest.json", "runs_dir="], "takes a manifest.json and at most runs_dir=FOLDER"),
+        (["--cfg", "algo=hipo"], "did you mean hippo?"),
+        (["--help", "algo.gama=1"], "did you mean algo.gamma?"),
+    ],
+)
+def test_flags_that_cannot_be_followed_are_refused(arguments, message, capsys):
+    assert message in refused(train.main, arguments, capsys)
+
+
 # ---------------------------------------------------------------------------------------------- one check of the scale
-
-
-def refused(main, arguments, capsys):
-    """What `main` says about arguments that it must refuse: at most three lines, exit code 2."""
-    try:
-        code = main(arguments)
-    except SystemExit as exit:
-        code = exit.code
-    said = capsys.readouterr()
-    assert code == 2
-    assert not said.out
-    assert said.err.count("\n") <= 3
-    return said.err
 
 
 @pytest.mark.parametrize("scale", ["nonsense", "../../tr", "", "Smoke"])

@@ -16,19 +16,24 @@ from hippo.envs.robots import ROBOTS
 from hippo.envs.vector import RobotTaskEnv
 
 
+def option(default: Any, doc: str) -> Any:
+    """A field of Options with its meaning."""
+    return dataclasses.field(default=default, metadata={"doc": doc})
+
+
 @dataclass
 class Options:
-    """Every option of an environment, at its default; the paper's choice unless its comment says otherwise."""
+    """Every option of an environment, at its default; the paper's choice unless its meaning says otherwise."""
 
-    physics: str = "paper"  # "fast" (ours): the same robot with a cheaper integrator
-    observation: str = "paper"  # Snake: "ego" leaves out absolute x, y and the centre of mass
-    perturbation: str | None = None  # one quantity of the dynamics changed, for Table 1
-    strength: str = "original"  # what a perturbation changes: the authors' elements, or "all" (ours)
-    velocity_penalty: bool = False  # Gather: penalise the centre of mass's speed, for Fig. 6
-    grid: str = "original"  # Gather: "symmetric" (ours) also places objects at +6 m
-    walls: bool = False  # Snake Gather (ours): the arena's walls hold the Snake; they always hold the Ant
-    position: bool = False  # Gather: append the torso's absolute x, y to the observation, for HIRO (Fig. 7)
-    terminate_on_fall: bool = False  # Block: rllab's conditions; the paper names none
+    physics: str = option("paper", "fast (ours): the same robot with a cheaper integrator")
+    observation: str = option("paper", "Snake: ego leaves out absolute x, y and the centre of mass")
+    perturbation: str | None = option(None, "one quantity of the dynamics changed, for Table 1")
+    strength: str = option("original", "what a perturbation changes: the authors' elements, or all (ours)")
+    velocity_penalty: bool = option(False, "Gather: penalise the centre of mass's speed, for Fig. 6")
+    grid: str = option("original", "Gather: symmetric (ours) also places objects at +6 m")
+    walls: bool = option(False, "Snake Gather (ours): the arena's walls hold the Snake; they always hold the Ant")
+    position: bool = option(False, "Gather: append the torso's absolute x, y to the observation, for HIRO (Fig. 7)")
+    terminate_on_fall: bool = option(False, "Block: rllab's conditions; the paper names none")
 
 
 @dataclass(frozen=True)
