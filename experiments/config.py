@@ -360,6 +360,8 @@ def compose_run(overrides: Sequence[str], runs_dir: Path | None = None) -> Run:
     config = _base(**groups).copy()
     for override in settings:
         _check_key(config, override.key_or_group, override.value())
+        if override.value() == MISSING:
+            raise ConfigError(override.key_or_group, MISSING, "must have a value")
         with _as_config_error(override.key_or_group, override.value()):
             OmegaConf.update(config, override.key_or_group, override.value())
     for key, name in names.items():

@@ -9,6 +9,7 @@ python -m experiments.sweep retry fig3                 once more what the machin
 
 import argparse
 import functools
+import math
 import os
 import shutil
 import signal
@@ -250,8 +251,8 @@ def check_options(options: argparse.Namespace) -> None:
     check_choice("order", options.order, ORDERS if options.launcher == "local" else ORDERS[:1])
     if options.workers < 1:
         raise ConfigError("workers", options.workers, "must be at least 1")
-    if not options.max_core_hours >= 0:  # neither negative nor nan, which is above nothing
-        raise ConfigError("max-core-hours", options.max_core_hours, "must be 0 or more")
+    if not 0 <= options.max_core_hours < math.inf:  # nor nan, which is above nothing
+        raise ConfigError("max-core-hours", options.max_core_hours, "must be 0 or more; --yes starts any number")
 
 
 def show_plan(options: argparse.Namespace, plan_of: Callable[[str], Plan]) -> int:
