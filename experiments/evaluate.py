@@ -20,7 +20,7 @@ from scipy import stats
 
 from experiments.command_line import Parser, bad_input, run_command
 from experiments.config import Run, algorithm
-from experiments.status import write_atomically
+from experiments.status import read_status, write_atomically
 from hippo.core import seeding
 from hippo.core.checkpoint import Checkpoint, CheckpointError
 from hippo.core.episodes import opening_episodes
@@ -52,6 +52,18 @@ def load_run(folder: Path) -> Run:
     if not (folder / "config.yaml").exists():
         raise ConfigError("run", folder, "is no run folder: it has no config.yaml")
     return Run.from_yaml((folder / "config.yaml").read_text(), folder.parent)
+
+
+def load_finished_run(folder: Path) -> Run:
+    """The run that lives in `folder`.
+
+    Raises:
+        ConfigError: it is no run folder, or its run is not finished.
+    """
+    run = load_run(folder)
+    if (state := read_status(folder)["state"]) != "finished":
+        raise ConfigError("run", folder, f"is {state}; only finished runs are taken")
+    return run
 
 
 def environments(run: Run, num_envs: int, seed: int, **changes: Any) -> RobotTaskEnv:

@@ -11,8 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from experiments.command_line import Parser, bad_input, run_command
-from experiments.evaluate import load_run
-from experiments.status import read_status
+from experiments.evaluate import load_finished_run
 from hippo.core import checkpoint
 from hippo.core.checkpoint import CheckpointError
 from hippo.core.settings import ConfigError
@@ -27,9 +26,7 @@ def export(folder: Path, target: Path) -> Path:
     Raises:
         ConfigError: `folder` is no run's, or its run is not finished. CheckpointError: its checkpoint is damaged.
     """
-    run, state = load_run(folder), read_status(folder)["state"]
-    if state != "finished":
-        raise ConfigError("run", folder, f"is {state}; only finished runs are exported")
+    run = load_finished_run(folder)
     content = checkpoint.load(folder / "checkpoint.pt")
     kept = {name: part for name, part in content.items() if name in ("iteration", *ACTING)}
     place = target / run.run_id

@@ -152,7 +152,7 @@ def test_what_is_no_finished_run_is_not_exported(trained, tmp_path, capsys):
     assert export.main([str(unfinished), "--to", str(tmp_path / "out")]) == 2
     errors = capsys.readouterr().err.splitlines()
     assert "is no run folder" in errors[0]
-    assert "only finished runs are exported" in errors[1]
+    assert "only finished runs are taken" in errors[1]
     assert not (tmp_path / "out").exists()
 
 

@@ -1,6 +1,7 @@
 """The mirror to Weights & Biases: exactly progress.csv, through kills; it may hang or fail; it never sees the key."""
 
 import csv
+import json
 import os
 import signal
 import subprocess
@@ -11,11 +12,12 @@ from pathlib import Path
 import psutil
 import pytest
 
+from experiments import mirror as mirror_command
 from experiments import train
 from experiments.config import compose_run
 from experiments.status import read_status
 from hippo.core import mirror
-from tests.wandb_log import history
+from tests.wandb_log import history, run_record
 
 ROOT = Path(__file__).parent.parent
 TINY = ["env=block_hopper", "scale=smoke", "iterations=3", "batch_size=400"]
@@ -99,6 +101,53 @@ def test_online_without_a_key_asks_nothing_and_stops_nothing(tmp_path, capsys, n
     assert train.execute(run) == "finished"
     assert "warning: the wandb mirror ended with exit code 1" in capsys.readouterr().err
     assert "wandb" in (run.folder / "wandb/mirror.log").read_text()
+    assert mirror_command.main([str(run.folder)]) == 1
+    assert capsys.readouterr().err == f"error: {run.folder} is not mirrored (log: {run.folder / 'wandb/mirror.log'})\n"
+
+
+def test_a_finished_run_is_mirrored_afterwards_as_if_during_training_with_group_and_tags(tmp_path, capsys, no_account):
+    runs = [compose_run([*TINY, f"seed={seed}", f"runs_dir={tmp_path}"]) for seed in (0, 1)]
+    for run in runs:
+        assert train.execute(run) == "finished"
+    (tmp_path / "plans/smoke").mkdir(parents=True)
+    plan = {"figure": "fig3", "runs": [{"run_id": runs[0].run_id}]}
+    (tmp_path / "plans/smoke/fig3.json").write_text(json.dumps(plan))
+    assert mirror_command.main([str(run.folder) for run in runs] + ["--mode", "offline"]) == 0
+    assert capsys.readouterr().out.endswith("".join(f"mirrored {run.folder}\n" for run in runs))
+    records = [run_record(run.folder) for run in runs]
+    for run, record in zip(runs, records, strict=True):
+        assert history(run.folder) == progress(run.folder)
+        assert (record.run_id, record.project) == (run.run_id, "hippo")
+    assert records[0].run_group == records[1].run_group
+    assert records[0].run_group.startswith("block_hopper hippo ")
+    assert mirror.labels(runs[0].folder)[0] != mirror.labels(other_settings(tmp_path).folder)[0]
+    common = {"env:block_hopper", "algo:hippo", "scale:smoke", "protocol:paper"}
+    assert [set(record.tags) - common for record in records] == [{"seed:0", "figure:fig3"}, {"seed:1"}]
+    assert all(common <= set(record.tags) for record in records)
+
+
+def other_settings(runs_dir):
+    """The folder of a run that differs in a setting, with what identifies it."""
+    run = compose_run([*TINY, "algo.gamma=0.9", f"runs_dir={runs_dir}"])
+    run.folder.mkdir()
+    manifest = {"run_id": run.run_id, "identity": run.identity, "config": run.to_yaml()}
+    (run.folder / "manifest.json").write_text(json.dumps(manifest))
+    return run
+
+
+def test_what_is_no_finished_run_is_not_mirrored(tmp_path, capsys):
+    run = compose_run([*TINY, f"runs_dir={tmp_path}"])
+    for folder, message in (
+        (tmp_path, "is no run folder"),
+        (run.folder, "is missing; only finished runs are taken"),
+    ):
+        run.folder.mkdir(exist_ok=True)
+        (run.folder / "config.yaml").write_text(run.to_yaml())
+        assert mirror_command.main([str(folder), "--mode", "offline"]) == 2
+        error = capsys.readouterr().err
+        assert message in error
+        assert error.count("\n") == 1
+        assert not list(tmp_path.rglob("wandb"))
 
 
 def test_the_mirror_is_no_part_of_a_runs_identity():

@@ -3,6 +3,7 @@
 import json
 import struct
 from pathlib import Path
+from typing import Any
 
 from wandb.proto.wandb_internal_pb2 import Record
 
@@ -47,3 +48,10 @@ def history(folder: Path) -> dict[int, dict[str, float]]:
             if union.setdefault(items["_step"], row) != row:
                 raise ValueError(f"{path}: step {items['_step']} differs from another session's")
     return union
+
+
+def run_record(folder: Path) -> Any:
+    """The record of the last offline log in a run's folder that names the run: id, group, tags."""
+    *_, path = sorted((folder / "wandb").glob("offline-run-*/run-*.wandb"))
+    (found, *_) = [record.run for record in records(path) if record.WhichOneof("record_type") == "run"]
+    return found

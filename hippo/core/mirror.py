@@ -12,6 +12,7 @@ wandb reads.
 
 import contextlib
 import csv
+import hashlib
 import json
 import os
 import signal
@@ -22,8 +23,19 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import yaml
+
 POLL_SECONDS = 1.0
+LOG = Path("wandb") / "mirror.log"  # in the run's folder
 WAIT_SECONDS = 30.0  # at a run's end for the mirror to catch up
+
+
+def start_mirror(folder: Path, mode: str, project: str) -> subprocess.Popen:
+    """A process that mirrors the run in `folder`, and ends when it has mirrored the end; what it says goes to LOG."""
+    (folder / LOG).parent.mkdir(exist_ok=True)
+    with (folder / LOG).open("a") as log:
+        command = [sys.executable, "-m", "hippo.core.mirror", str(folder), mode, project]
+        return subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=log)
 
 
 @contextlib.contextmanager
@@ -35,11 +47,7 @@ def mirrored(folder: Path, mode: str, project: str) -> Iterator[None]:
     if mode == "disabled":
         yield
         return
-    corner = folder / "wandb"
-    corner.mkdir(exist_ok=True)
-    with (corner / "mirror.log").open("a") as log:
-        command = [sys.executable, "-m", "hippo.core.mirror", str(folder), mode, project]
-        process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=log)
+    process = start_mirror(folder, mode, project)
     try:
         yield
     finally:
@@ -50,7 +58,7 @@ def mirrored(folder: Path, mode: str, project: str) -> Iterator[None]:
             problem = f"did not finish within {WAIT_SECONDS:.0f} s and was stopped"
         if problem:
             print(
-                f"warning: the wandb mirror {problem}; progress.csv is complete (log: {corner / 'mirror.log'})",
+                f"warning: the wandb mirror {problem}; progress.csv is complete (log: {folder / LOG})",
                 file=sys.stderr,
                 flush=True,
             )
@@ -67,12 +75,29 @@ def covered_rows(folder: Path) -> tuple[list[dict[str, str]], bool]:
     return rows if state in ("finished", "diverged") else rows[:-1], state != "running"
 
 
+def labels(folder: Path) -> tuple[str, list[str]]:
+    """How wandb finds the run in `folder`: the group of those that differ in their seed only, and its tags.
+
+    The figures are those whose plans, written beside the run by sweeps, name it.
+    """
+    manifest = json.loads((folder / "manifest.json").read_text())
+    identity, run = manifest["identity"], yaml.safe_load(manifest["config"])
+    of_all_seeds = json.dumps({key: value for key, value in identity.items() if key != "seed"}, sort_keys=True)
+    group = f"{identity['env']} {identity['algo']} {hashlib.sha256(of_all_seeds.encode()).hexdigest()[:8]}"
+    tags = [f"{key}:{identity[key]}" for key in ("env", "algo", "seed")]
+    tags += [f"scale:{run['scale']}", f"protocol:{run.get('protocol', 'paper')}"]  # older runs do not say
+    plans = (json.loads(path.read_text()) for path in (folder.parent / "plans").glob("*/*.json"))
+    figures = {plan["figure"] for plan in plans if manifest["run_id"] in (run["run_id"] for run in plan["runs"])}
+    return group, [*tags, *(f"figure:{figure}" for figure in sorted(figures))]
+
+
 def start(folder: Path, mode: Any, project: str) -> Any:
     """The wandb run with this run's id; nothing of the machine, the code or the console is sent along."""
     import wandb
 
     manifest = json.loads((folder / "manifest.json").read_text())
     identity = manifest["identity"]
+    group, tags = labels(folder)
     settings = wandb.Settings(
         console="off",
         disable_code=True,
@@ -87,6 +112,8 @@ def start(folder: Path, mode: Any, project: str) -> Any:
         project=project,
         id=manifest["run_id"],
         name=f"{identity['env']} {identity['algo']} seed {identity['seed']}",
+        group=group,
+        tags=tags,
         config=identity,
         dir=folder,
         mode=mode,
@@ -96,7 +123,7 @@ def start(folder: Path, mode: Any, project: str) -> Any:
 
 
 def mirror(folder: Path, mode: str, project: str) -> None:
-    """Follow the run in `folder` until it ends or the process that trains it is gone."""
+    """Follow the run in `folder` until it ends, at once if it has, or the process that trains it is gone."""
     trainer, run = os.getppid(), start(folder, mode, project)
     mirrored_steps = run.step  # 0, or what an online run of this id already holds
     ended = False
