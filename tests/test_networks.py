@@ -23,25 +23,6 @@ def plain(net: networks.MLP, activation: type) -> nn.Sequential:
     return nn.Sequential(*modules[:-1])
 
 
-def activated(x: np.ndarray, bias: float, is_tanh: bool = True) -> np.ndarray:
-    y = x[:, None].copy()
-    networks._activate(y, np.array([bias], x.dtype), is_tanh)
-    return y[:, 0]
-
-
-def test_tanh_is_within_four_units_of_the_seventh_digit_and_saturates_at_one():
-    x = np.concatenate([np.linspace(-12, 12, 400_001), [1e-30, -1e-7, 50.0, -np.inf]]).astype(np.float32)
-    exact = np.tanh(x.astype(np.float64))
-    ours = activated(x, 0.0)
-    np.testing.assert_allclose(ours, exact, rtol=4e-7, atol=0)
-    assert np.abs(ours).max() == 1.0
-    for is_tanh in (True, False):
-        assert np.isnan(activated(np.array([np.nan], np.float32), 0.0, is_tanh))
-    np.testing.assert_array_equal(activated(np.float32([0.25, -0.5]), 0.75), activated(np.float32([1.0, 0.25]), 0.0))
-    above, below = (np.array(c, np.float64)[:6][::-1] for c in (networks.P, networks.Q))  # the fraction cut too early
-    assert np.abs(x * np.polyval(above, x * x) / np.polyval(below, x * x) - exact)[np.abs(x) < 9].max() > 1e-4
-
-
 @pytest.mark.parametrize("activation", [nn.Tanh, nn.ReLU])
 @pytest.mark.parametrize("sizes", [(3, 2), (3, 5, 2), (3, 7, 5, 1)])
 def test_an_mlp_and_all_its_gradients_are_those_of_torchs_layers(activation, sizes, monkeypatch):
@@ -88,27 +69,6 @@ def test_the_skill_layer_is_a_linear_layer_over_the_one_hot_input(integration, c
 def test_an_unknown_integration_is_named():
     with pytest.raises(ValueError, match="integration=sum"):
         SkillLinear(3, 4, 5, "sum", generator())
-
-
-@pytest.mark.parametrize("rows", [1, 3, 4, 50, 1000])
-@pytest.mark.parametrize("sizes", [(17, 32, 32, 1), (64, 64, 6), (17, 256, 64, 3)])
-def test_single_precision_is_close_to_float64(rows, sizes):
-    """Also of a first weight whose memory is transposed and a bias whose memory is strided."""
-    net = mlp(sizes, generator())
-    x = torch.randn(rows, sizes[0], generator=generator(), requires_grad=True)
-    weight = torch.randn(sizes[0], sizes[1], 3, generator=generator(1))[..., 1].T.unsqueeze(0).requires_grad_()
-    bias = torch.randn(sizes[1], 3, generator=generator(2))[:, 1].unsqueeze(0).requires_grad_()
-    leaves = [x, weight, bias, *(p for layer in net.layers[1:] for p in layer.parameters())]
-    y = grouped_layers(x, [rows], weight, bias, net.layers[1:], nn.Tanh)
-    gradient = torch.randn(y.shape, generator=generator(3))
-    ours = torch.autograd.grad(y, leaves, gradient)
-    exact = [leaf.detach().double().requires_grad_() for leaf in leaves]
-    reference = exact[0] @ exact[1][0].T + exact[2]
-    for w, b in zip(exact[3::2], exact[4::2], strict=True):
-        reference = torch.tanh(reference) @ w.T + b
-    torch.testing.assert_close(y.double(), reference, rtol=1e-4, atol=1e-4)
-    for mine, theirs in zip(ours, torch.autograd.grad(reference, exact, gradient.double()), strict=True):
-        torch.testing.assert_close(mine.double(), theirs, rtol=1e-4, atol=5e-4)
 
 
 def test_numbers_do_not_depend_on_the_size_of_a_block(monkeypatch):

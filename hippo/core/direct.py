@@ -153,7 +153,8 @@ def _through_surrogate(
     """
     kl, clipped, surrogate = 0.0, 0.0, 0.0
     for i in range(len(log_prob)):
-        log_ratio = log_prob[i] - old[i]
+        # In float64, where what is not clipped is exactly itself: else rounding drops rows from the gradient.
+        log_ratio = np.float64(log_prob[i]) - old[i]
         ratio = np.exp(log_ratio)
         bounded = min(max(ratio, 1 - clip_range), 1 + clip_range)
         kl += ratio - 1 - log_ratio
