@@ -9,6 +9,7 @@ SCALE ?= smoke
 LAUNCHER ?= local
 RUNS_DIR ?= runs
 #= SCALE=smoke|laptop|paper  how much is trained: minutes (default), hours to days, a cluster
+#= PROTOCOL=paper|modern      how it is trained: as printed (default), or as strong as today
 #= LAUNCHER=local|slurm      where: on this machine (default), or as jobs of a Slurm cluster
 #= PROFILE=FILE              slurm: what jobs ask for, a copy of experiments/conf/slurm/default.yaml
 #= WORKERS=N                 local: runs trained at once (default: one per core)
@@ -20,10 +21,11 @@ PY = $(BIN)/python -m
 q = '$(subst ','\'',$(1))'# one word to the shell, whatever it holds
 given = $(call q,$(value $(1)))# a variable as it was typed: make reads no $ in it
 
-PLAN_FLAGS = --scale $(call given,SCALE) --runs-dir $(call given,RUNS_DIR) $(if $(FRESH),--fresh)
+EDITION = --scale $(call given,SCALE) $(if $(value PROTOCOL),--protocol $(call given,PROTOCOL))
+PLAN_FLAGS = $(EDITION) --runs-dir $(call given,RUNS_DIR) $(if $(FRESH),--fresh)
 SWEEP_FLAGS = $(PLAN_FLAGS) --launcher $(call given,LAUNCHER) $(if $(YES),--yes) $(if $(filter slurm,$(LAUNCHER)),--wait)
 SWEEP_FLAGS += $(if $(value PROFILE),--profile $(call given,PROFILE)) $(if $(value WORKERS),--workers $(call given,WORKERS))
-DRAW_FLAGS = --scale $(call given,SCALE) --runs-dir $(call given,RUNS_DIR)
+DRAW_FLAGS = $(EDITION) --runs-dir $(call given,RUNS_DIR)
 
 FIGURES := $(filter fig%,$(basename $(notdir $(wildcard paper_figures/fig*.py))))
 TABLES := $(filter table%,$(basename $(notdir $(wildcard paper_figures/table*.py))))
@@ -71,12 +73,16 @@ claims: plans  ## the paper's comparative sentences and what the results at SCAL
 	@$(PY) analysis.claims $(DRAW_FLAGS)
 
 results: install  ## docs/results.md and its pictures, from the committed results
-	@for scale in laptop paper; do $(PY) experiments.sweep write all --scale $$scale --runs-dir build/results; done
-	@for csv in paper_figures/data/*/fig*.csv; do \
-		scale=$$(basename $$(dirname $$csv)); figure=$$(basename $$csv .csv); \
-		$(PY) paper_figures.$$figure --scale $$scale --runs-dir build/results --out build/results/out > /dev/null && \
-		cp build/results/out/$$scale/$$figure.png docs/pictures/$${scale}_$$figure.png; \
-	done
+	@for protocol in paper modern; do for scale in laptop paper; do \
+		edition="--scale $$scale --protocol $$protocol --runs-dir build/results"; \
+		$(PY) experiments.sweep write all $$edition || exit; \
+		[ $$protocol = paper ] && folder=$$scale || folder=$$protocol/$$scale; \
+		for csv in $$(ls paper_figures/data/$$folder/fig*.csv 2> /dev/null); do \
+			figure=$$(basename $$csv .csv); \
+			$(PY) paper_figures.$$figure $$edition --out build/results/out > /dev/null && \
+			cp build/results/out/$$folder/$$figure.png docs/pictures/$${folder/\//_}_$$figure.png || exit; \
+		done; \
+	done; done
 	@$(PY) analysis.results --runs-dir build/results
 
 plan-%: install

@@ -17,6 +17,7 @@ import yaml
 from scipy import stats as scipy_stats
 
 from analysis.command_line import parser
+from analysis.edition import PAPER, chosen
 from analysis.predicates import KINDS, Kind, Pairs, Printed, Spec
 from analysis.runs import MissingData, Results, load
 
@@ -141,7 +142,7 @@ def own_numbers(claim: Claim, paper: dict[str, Any]) -> str:
     return f"holds in {printed.holds} of {printed.places}{needed}{opposite}: {printed.words}"
 
 
-def lines(scale: str, runs_dir: Path, data_dir: Path) -> list[str]:
+def lines(scale: str, runs_dir: Path, data_dir: Path, protocol: str = PAPER) -> list[str]:
     """The table as Markdown lines."""
     paper = yaml.safe_load((ROOT / "paper_figures" / "paper_values.yaml").read_text())
     out = [SMOKE, ""] if scale == "smoke" else []
@@ -152,7 +153,7 @@ def lines(scale: str, runs_dir: Path, data_dir: Path) -> list[str]:
     results: dict[str, Results | None] = {}
     for figure in {claim.figure for claim in CLAIMS if claim.figure is not None and scale != "smoke"}:
         try:
-            results[figure] = load(figure, scale, runs_dir, data_dir, metrics=None)
+            results[figure] = load(figure, scale, runs_dir, data_dir, None, protocol)
         except MissingData:
             results[figure] = None
     for claim in CLAIMS:
@@ -169,11 +170,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Print the table and write claims.md."""
     options = parser("analysis.claims", __doc__.splitlines()[0]).parse_args(arguments)
     try:
-        text = "\n".join(lines(options.scale, options.runs_dir, options.data)) + "\n"
+        text = "\n".join(lines(options.scale, options.runs_dir, options.data, options.protocol)) + "\n"
     except ValueError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    path = options.out / options.scale / "claims.md"
+    path = options.out / chosen(options).folder / "claims.md"
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(text)
     print(text, end="")

@@ -15,6 +15,8 @@ from typing import Any
 
 import yaml
 
+from analysis.edition import Edition
+
 STATED = re.compile(rb"(\d+) runs, set [0-9a-f]{12}: ((?:[0-9a-f]{12} ?)+)")
 
 
@@ -42,7 +44,7 @@ def run_ids(path: Path) -> list[str]:
 
 def plans(runs_dir: Path) -> list[dict[str, Any]]:
     """Every plan that was written in `runs_dir`."""
-    return [json.loads(path.read_text()) for path in sorted((runs_dir / "plans").glob("*/*.json"))]
+    return [json.loads(path.read_text()) for path in sorted((runs_dir / "plans").rglob("*.json"))]
 
 
 def describe_run(folder: Path) -> list[str]:
@@ -76,7 +78,7 @@ def describe_run(folder: Path) -> list[str]:
             lines.append(f"return of the last iteration: {float(rows[-1]['return_mean']):.3f}")
     lines.append(f"commit {manifest['git_commit']}{' and changes to it' if manifest['git_difference'] else ''}")
     shown = [
-        f"{plan['figure']} at scale {plan['scale']} as {of['variant']}"
+        f"{plan['figure']} at {Edition.planned(plan)} as {of['variant']}"
         for plan in plans(folder.parent)
         for of in plan["runs"]
         if of["run_id"] == manifest["run_id"]
@@ -89,7 +91,8 @@ def describe(ids: Sequence[str], runs_dir: Path) -> list[str]:
     """A line per run: what it is, from the plans, and the commit it was trained at, where its folder is here."""
     planned: dict[str, tuple[str, dict[str, Any]]] = {}
     for plan in plans(runs_dir):
-        planned |= {run["run_id"]: (plan["scale"], run) for run in plan["runs"]}
+        what = ", ".join([plan["scale"], *Edition.planned(plan).marks])
+        planned |= {run["run_id"]: (what, run) for run in plan["runs"]}
     lines = []
     for run_id in ids:
         words = [run_id]

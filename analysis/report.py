@@ -18,6 +18,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup, escape
 
 from analysis.command_line import parser
+from analysis.edition import chosen
 from analysis.report_data import Artefact, Report, RunFacts, Table, gather
 from analysis.runs import MissingData
 
@@ -187,12 +188,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Write report.html and report.md; exit code 2 where there is nothing to report."""
     options = parser("analysis.report", __doc__.splitlines()[0]).parse_args(arguments)
     try:
-        report = gather(options.scale, options.runs_dir, options.data, options.out)
+        report = gather(chosen(options), options.runs_dir, options.data, options.out)
         pages = render(report)
     except (MissingData, ValueError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    folder = options.out / options.scale
+    folder = options.out / chosen(options).folder
     folder.mkdir(parents=True, exist_ok=True)
     for line in report.not_drawn:
         print(f"missing: {line}")

@@ -1,6 +1,7 @@
 """What the report says of one scale, gathered from files alone: what was drawn, the runs behind it, claims, files."""
 
 import csv
+import dataclasses
 import json
 import re
 from collections import Counter
@@ -12,7 +13,8 @@ from typing import Any
 from PIL import Image
 
 from analysis import explain
-from analysis.runs import MissingData
+from analysis.edition import OVERRIDDEN, Edition
+from analysis.runs import MissingData, check_edition
 
 ROOT = Path(__file__).parent.parent
 LEDGER = ROOT / "docs" / "hyperparameters.csv"
@@ -81,7 +83,7 @@ class Artefact:
 class Report:
     """Everything on the page."""
 
-    scale: str
+    edition: Edition
     artefacts: list[Artefact]
     not_drawn: list[str]
     runs: list[RunFacts]
@@ -153,20 +155,19 @@ def read_json(path: Path) -> dict[str, Any]:
     return content
 
 
-def read_plans(folder: Path) -> dict[str, dict[str, Any]]:
-    """Plans by figure.
+def read_plans(plans_dir: Path, edition: Edition) -> dict[str, dict[str, Any]]:
+    """Plans of one edition, by figure.
 
     Raises:
-        ValueError: one lacks what a plan has.
+        ValueError: one lacks what a plan has, or is of another edition.
     """
     plans = {}
-    for path in sorted(folder.glob("*.json"), key=lambda path: natural(path.stem)):
+    for path in sorted((plans_dir / edition.folder).glob("*.json"), key=lambda path: natural(path.stem)):
         plan = read_json(path)
         missing = {"figure", "scale", "title", "runs"} - set(plan)
         if missing:
             raise ValueError(f"{path}: is no plan, it lacks {', '.join(sorted(missing))}")
-        if plan["scale"] != folder.name:
-            raise ValueError(f"{path}: is a plan of scale {plan['scale']}, not of {folder.name}")
+        check_edition(path, plan, edition)
         plans[path.stem] = plan
     return plans
 
@@ -306,19 +307,22 @@ def drawn_names(folder: Path) -> list[str]:
     return sorted(names, key=natural)
 
 
-def not_drawn(scale: str, drawn: Iterable[str], plans: dict[str, dict[str, Any]], states: dict[str, str]) -> list[str]:
+def not_drawn(
+    edition: Edition, drawn: Iterable[str], plans: dict[str, dict[str, Any]], states: dict[str, str]
+) -> list[str]:
     """A line per figure and table of the suite, or of a plan, that is not on the page, and what to type for it."""
     scripts = (ROOT / "paper_figures").glob("*.py")
     suite = {path.stem for path in scripts if re.fullmatch(r"(fig|table)\d+", path.stem)}
     lines = []
     for name in sorted((suite | set(plans)) - set(drawn), key=natural):
         if name in plans and not plans[name]["runs"]:
-            others = " or ".join(f"make {name} SCALE={other}" for other in plans[name].get("scales", []))
-            lines.append(f"{name}: not trained at scale {scale}" + (f"; {others}" if others else ""))
+            elsewhere = [dataclasses.replace(edition, scale=scale) for scale in plans[name].get("scales", [])]
+            others = " or ".join(f"make {name} {each.variables}" for each in elsewhere)
+            lines.append(f"{name}: not trained at {edition}" + (f"; {others}" if others else ""))
         elif name in plans and not any(drawable(run, states) for run in plans[name]["runs"]):
-            lines.append(f"{name}: nothing to draw yet; make {name} SCALE={scale} trains it")
+            lines.append(f"{name}: nothing to draw yet; make {name} {edition.variables} trains it")
         else:
-            lines.append(f"{name}: not drawn; make draw-{name} SCALE={scale}")
+            lines.append(f"{name}: not drawn; make draw-{name} {edition.variables}")
     return lines
 
 
@@ -337,9 +341,9 @@ def origin(plans: dict[str, dict[str, Any]], states: dict[str, str]) -> Table:
     return Table(["artefact", "runs", "committed results", "trained here", "not there"], rows)
 
 
-def committed_files(scale: str, data: Path) -> Table:
-    """What of paper_figures/data stands behind this scale: results, skills and frames."""
-    groups = (("results", data / scale), ("skills", data / "skills"), ("frames", data / "frames"))
+def committed_files(edition: Edition, data: Path) -> Table:
+    """What of paper_figures/data stands behind this edition: results, skills and frames."""
+    groups = (("results", data / edition.folder), ("skills", data / "skills"), ("frames", data / "frames"))
     rows = []
     for what, folder in groups:
         if files := sorted(path for path in folder.glob("*") if path.is_file()):
@@ -356,38 +360,39 @@ def read_table_csv(path: Path) -> Table:
     return Table(header, rows)
 
 
-def scales(runs_dir: Path, out: Path) -> list[str]:
-    """Scales at which something was planned or drawn."""
-    folders = {path.parent for path in (runs_dir / "plans").glob("*/*.json")}
-    return sorted({path.name for path in (*folders, *(path for path in out.glob("*") if drawn_names(path)))})
+def folders(runs_dir: Path, out: Path) -> list[str]:
+    """Folders of the editions without overrides, such as laptop or modern/laptop: what was planned or drawn."""
+    plans = {path.parent.relative_to(runs_dir / "plans") for path in (runs_dir / "plans").rglob("*.json")}
+    drawn = {path.relative_to(out) for path in out.glob("*") if drawn_names(path)}
+    return sorted(str(folder) for folder in plans | drawn if folder.name != OVERRIDDEN)
 
 
-def gather(scale: str, runs_dir: Path, data: Path, out: Path) -> Report:
-    """Everything there is at one scale.
+def gather(edition: Edition, runs_dir: Path, data: Path, out: Path) -> Report:
+    """Everything there is of one edition.
 
     Raises:
         MissingData: nothing was drawn and nothing planned.
         ValueError: a file is damaged; the message names it.
     """
-    folder = out / scale
-    plans, names = read_plans(runs_dir / "plans" / scale), drawn_names(folder)
+    folder = out / edition.folder
+    plans, names = read_plans(runs_dir / "plans", edition), drawn_names(folder)
     if not plans and not names:
-        known = ", ".join(scales(runs_dir, out)) or "none"
+        known = ", ".join(folders(runs_dir, out)) or "none"
         raise MissingData(
-            f"scale={scale}: nothing was drawn or planned (scales that have something: {known}); "
-            f"run `make draw-all SCALE={scale}`"
+            f"{edition}: nothing was drawn or planned (there is something in: {known}); "
+            f"run `make draw-all {edition.variables}`"
         )
     runs = read_runs(plans, runs_dir)
     states = {run.run_id: run.state for run in runs}
     claims = folder / "claims.md"
     text = claims.read_text() if claims.exists() else ""
     return Report(
-        scale=scale,
+        edition=edition,
         artefacts=[read_artefact(name, folder, plans.get(name), states) for name in names],
-        not_drawn=not_drawn(scale, names, plans, states),
+        not_drawn=not_drawn(edition, names, plans, states),
         runs=runs,
         origin=origin(plans, states),
-        committed_files=committed_files(scale, data),
+        committed_files=committed_files(edition, data),
         claims=markdown_table(text),
         claims_notes=[line for line in text.splitlines() if line and not line.startswith("|")],
         ledger=read_table_csv(LEDGER),

@@ -1,6 +1,7 @@
 """What the committed results say, as a page: `make results` writes docs/results.md and the pictures beside it.
 
-Only rows under paper_figures/data count, never what happens to be trained here; scales are never pooled.
+Only rows under paper_figures/data count, never what happens to be trained here; scales and protocols are never
+pooled.
 """
 
 import argparse
@@ -12,6 +13,8 @@ import numpy as np
 
 from analysis import stats
 from analysis.claims import CLAIMS, NO_DATA, judge
+from analysis.command_line import PROTOCOLS
+from analysis.edition import Edition
 from analysis.runs import MissingData, Results, load, scores
 
 ROOT = Path(__file__).parent.parent
@@ -49,7 +52,7 @@ def performance(results: Results, env: str) -> list[str]:
 def section(results: Results, pictures: Path) -> list[str]:
     """One figure: its picture and its numbers."""
     plan = results.plan
-    name = f"{plan['scale']}_{plan['figure']}.png"
+    name = "_".join([*results.edition.folder.parts, f"{plan['figure']}.png"])
     lines = [f"## {plan['title']} ({plan['figure']}, {plan['scale']} scale)", ""]
     if (pictures / name).exists():
         lines += [f"![{plan['title']}](pictures/{name})", ""]
@@ -92,15 +95,15 @@ def table_section(results: Results) -> list[str]:
         cells = [f"{values[metric, env, variant]:.3g}" for env, variant in shown]
         lines.append(f"| {metric} | {' | '.join(cells)} |")
     seeds = results.frame.groupby(["env", "variant"])["seed"].nunique()
-    command = f"`make draw-{plan['figure']} SCALE={plan['scale']}`"
+    command = f"`make draw-{plan['figure']} {results.edition.variables}`"
     lines += ["", f"{seeds.min()} seeds. {command} names each definition and puts the paper's values beside it.", ""]
     return lines
 
 
-def verdicts(scale: str, results: dict[str, Results]) -> list[str]:
-    """The claims that the committed figures of one scale can say something about."""
+def verdicts(edition: Edition, results: dict[str, Results]) -> list[str]:
+    """The claims that the committed figures of one edition can say something about."""
     lines = [
-        f"## Verdicts, {scale} scale",
+        f"## Verdicts, {edition.called}",
         "",
         "| sentence | where | verdict | difference [interval] |",
         "|---|---|---|---|",
@@ -117,11 +120,11 @@ def verdicts(scale: str, results: dict[str, Results]) -> list[str]:
 def page(runs_dir: Path, data: Path, pictures: Path) -> str:
     """The whole page, from plans in `runs_dir` (for names only) and rows in `data`."""
     lines = [HEAD]
-    for scale in SCALES:
+    for edition in (Edition(scale, protocol) for protocol in PROTOCOLS for scale in SCALES):
         results = {}
-        for path in sorted((data / scale).glob("*.csv")):
+        for path in sorted((data / edition.folder).glob("*.csv")):
             try:
-                results[path.stem] = load(path.stem, scale, runs_dir, data, metrics=None)
+                results[path.stem] = load(path.stem, edition.scale, runs_dir, data, None, edition.protocol)
             except MissingData as error:
                 raise ValueError(f"{path}: {error}") from error
         curves = {name: each for name, each in results.items() if name.startswith("fig")}
@@ -133,7 +136,7 @@ def page(runs_dir: Path, data: Path, pictures: Path) -> str:
             if name not in curves:
                 lines += table_section(each)
         if results:
-            lines += verdicts(scale, results)
+            lines += verdicts(edition, results)
     if len(lines) == 1:
         lines.append("No results are committed yet.")
     return "\n".join(lines).rstrip() + "\n"

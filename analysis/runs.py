@@ -1,6 +1,7 @@
 """Runs to one tidy frame: a row per (run, environment step, metric), from run folders and from committed results.
 
-What belongs to a figure stands in its plan, `<runs_dir>/plans/<scale>/<figure>.json`, which experiments.sweep writes.
+What belongs to a figure stands in its plan, `<runs_dir>/plans/<scale>/<figure>.json`, which experiments.sweep writes;
+edition.py says where those of another protocol, and of figures with overrides, lie.
 """
 
 import hashlib
@@ -12,6 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
+
+from analysis.edition import PAPER, Edition
 
 COLUMNS = ["figure", "scale", "env", "variant", "seed", "run_id", "env_steps", "metric", "value"]
 
@@ -32,6 +35,15 @@ class Results:
     frame: pd.DataFrame  # COLUMNS
     missing: list[dict[str, Any]]  # planned runs without a single row, or cut short, as they stand in the plan
     commits: list[str] = field(default_factory=list)  # at which the runs whose folders are here were trained
+
+    @property
+    def edition(self) -> Edition:
+        """Its scale, protocol and overrides."""
+        return Edition.planned(self.plan)
+
+    def stem(self, out: Path) -> Path:
+        """Where under `out` its files go, without a suffix."""
+        return out / self.edition.folder / self.plan["figure"]
 
     def provenance(self) -> str:
         """The runs behind the data and the commits they were trained at, as one line."""
@@ -70,30 +82,40 @@ class Results:
 
 
 def load(
-    figure: str, scale: str, runs_dir: Path, data_dir: Path, metrics: Sequence[str] | None = ("return_mean",)
+    figure: str,
+    scale: str,
+    runs_dir: Path,
+    data_dir: Path,
+    metrics: Sequence[str] | None = ("return_mean",),
+    protocol: str = PAPER,
+    settings: Sequence[str] = (),
 ) -> Results:
     """Read every run of a figure: the rows of its folder, or the committed ones where the plan says `committed`.
 
     Args:
         metrics: columns of progress.csv to read, None for all.
+        settings: what is overridden in every run.
 
     Raises:
         MissingData: no plan, or not one row. NotAtThisScale: there will never be one.
-        ValueError: rows of two scales, or of two kinds of physics for one environment, which must not be drawn
-            together; a plan that is no JSON.
+        ValueError: rows of two editions, or of two kinds of physics for one environment, which must not be drawn
+            together; a plan that is no JSON; `figure` is none, or one with overrides.
     """
-    path = runs_dir / "plans" / scale / f"{figure}.json"
+    edition = Edition.of(scale, protocol, settings)
+    name = edition.name(figure)
+    path = runs_dir / "plans" / edition.folder / f"{name}.json"
     if not path.exists():
-        raise MissingData(f"{figure}: no plan at scale {scale} in {runs_dir}; run `make draw-{figure} SCALE={scale}`")
+        write = f"python -m experiments.sweep write {figure} {edition.options}"
+        command = write if edition.overrides else f"make draw-{figure} {edition.variables}"
+        raise MissingData(f"{figure}: no plan at {edition} in {runs_dir}; run `{command}`")
     plan = json.loads(path.read_text())
-    if plan["scale"] != scale:
-        raise ValueError(f"{path}: is a plan of scale {plan['scale']}, not of {scale}")
+    check_edition(path, plan, edition)
     if not plan["runs"]:
-        raise NotAtThisScale(f"{figure}: not trained at scale {scale}, only at {', '.join(plan['scales'])}")
+        raise NotAtThisScale(f"{figure}: not trained at {edition}, only at {', '.join(plan['scales'])}")
     physics = pd.DataFrame(plan["runs"]).groupby("env")["physics"].nunique()
     if (physics > 1).any():
         raise ValueError(f"{figure}: {physics.idxmax()} mixes two kinds of physics")
-    committed = read_committed(data_dir / scale / f"{figure}.csv", scale)
+    committed = read_committed(data_dir / edition.folder / f"{name}.csv", scale)
     if metrics is not None:
         committed = committed[committed["metric"].isin(metrics)]
     parts, missing = [], []
@@ -110,14 +132,21 @@ def load(
             missing.append(run)
         if not rows.empty:  # an empty part would turn numbers into objects
             labels = {key: run[key] for key in ("env", "variant", "seed", "run_id")}
-            parts.append(rows.assign(figure=figure, scale=scale, **labels))
+            parts.append(rows.assign(figure=name, scale=scale, **labels))
     frame = pd.concat(parts, ignore_index=True)[COLUMNS] if parts else pd.DataFrame(columns=COLUMNS)
     if frame.empty:
+        train = f"python -m experiments.sweep run {figure} {edition.options}"
+        command = train if edition.overrides else f"make {figure} {edition.variables}"
         raise MissingData(
-            f"{figure}: none of its {len(plan['runs'])} runs at scale {scale} has a result yet; "
-            f"`make {figure} SCALE={scale}` trains them"
+            f"{figure}: none of its {len(plan['runs'])} runs at {edition} has a result yet; `{command}` trains them"
         )
     return Results(plan, frame, missing, read_commits(runs_dir, sorted(set(frame["run_id"]))))
+
+
+def check_edition(path: Path, plan: dict[str, Any], edition: Edition) -> None:
+    """Raise ValueError if the plan that was read from `path` says that it is of another edition."""
+    if (other := Edition.planned(plan)) != edition:
+        raise ValueError(f"{path}: is a plan of {other}, not of {edition}")
 
 
 def read_commits(runs_dir: Path, ids: Sequence[str]) -> list[str]:
@@ -152,7 +181,7 @@ def read_committed(path: Path, scale: str) -> pd.DataFrame:
     """Committed rows of a figure, empty where there are none.
 
     Raises:
-        ValueError: a row is of another scale.
+        ValueError: a row is of another scale, or of another figure, such as one with overrides.
     """
     if not path.exists():
         return pd.DataFrame(columns=COLUMNS)
@@ -160,6 +189,8 @@ def read_committed(path: Path, scale: str) -> pd.DataFrame:
     others = set(table["scale"]) - {scale}
     if others:
         raise ValueError(f"{path}: holds rows of scale {', '.join(sorted(others))}, not only of {scale}")
+    if strangers := set(table["figure"]) - {path.stem}:
+        raise ValueError(f"{path}: holds rows of {', '.join(sorted(strangers))}, not only of {path.stem}")
     return table
 
 

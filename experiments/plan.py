@@ -11,13 +11,14 @@ from typing import Any
 
 import yaml
 
+from analysis.edition import PAPER, Edition
 from experiments import costs
 from experiments.command_line import duration
 from experiments.config import COMMITTED, CONF, Run, check_choice, choices, compose_run
 from experiments.status import DONE, is_there, read_status, write_atomically
 from hippo.core.settings import ConfigError
 
-FIXED = ("env", "algo", "scale", "seed", "runs_dir")  # the plan's own business, not that of --set
+FIXED = ("env", "algo", "scale", "protocol", "seed", "runs_dir")  # the plan's own business, not that of --set
 
 
 @dataclass
@@ -33,13 +34,14 @@ class Entry:
 
 @dataclass
 class Plan:
-    """All runs of one figure at one scale."""
+    """All runs of one figure in one edition."""
 
     figure: str
-    scale: str
+    edition: Edition
     description: dict[str, Any]  # conf/figure/<figure>.yaml
     fresh: bool  # committed results do not count
     entries: list[Entry]
+    refused: list[dict[str, str]] = dataclasses.field(default_factory=list)  # what the protocol cannot train
     whole: "Plan | None" = None  # of which this is a part
 
     def runs(self) -> list[Run]:
@@ -82,15 +84,17 @@ class Plan:
 
         Of a part the whole is written: what there is to draw does not depend on what was trained last.
         """
-        path = runs_dir / "plans" / self.scale / f"{self.figure}.json"
+        edition, name = self.edition, self.edition.name(self.figure)
+        path = runs_dir / "plans" / edition.folder / f"{name}.json"
         path.parent.mkdir(parents=True, exist_ok=True)
-        left_out = self.description.get("not_trained", {}).get(self.scale, [])
+        left_out = self.description.get("not_trained", {}).get(edition.scale, [])
         content = {
-            "figure": self.figure,
-            "scale": self.scale,
-            "title": self.description["title"],
+            "figure": name,
+            **dataclasses.asdict(edition),
+            "title": ", ".join([self.description["title"], *edition.marks]),
             "scales": trained_at(self.description),
             "not_trained": [{"env": env, "env_label": env_label(env)} for env in left_out],
+            "refused": self.refused,
             "runs": [
                 {
                     "run_id": e.run.run_id,
@@ -137,35 +141,46 @@ def env_label(env: str) -> str:
     return yaml.safe_load((CONF / "env" / f"{env}.yaml").read_text())["label"]
 
 
-def committed_runs(figure: str, scale: str) -> set[str]:
-    """Ids of the runs whose rows are committed for this figure and scale."""
-    path = COMMITTED / scale / f"{figure}.csv"
-    if not path.exists():
+def committed_runs(figure: str, edition: Edition) -> set[str]:
+    """Ids of the runs whose rows are committed for this figure and edition; with overrides, none ever are."""
+    path = COMMITTED / edition.folder / f"{figure}.csv"
+    if edition.overrides or not path.exists():
         return set()
     with path.open() as file:
         return {row["run_id"] for row in csv.DictReader(file)}
 
 
-def make_plan(figure: str, scale: str, settings: Sequence[str], fresh: bool, runs_dir: Path) -> Plan:
-    """Resolve a figure into runs and look up how each is doing."""
+def make_plan(
+    figure: str, scale: str, settings: Sequence[str], fresh: bool, runs_dir: Path, protocol: str = PAPER
+) -> Plan:
+    """Resolve a figure into runs and look up how each is doing.
+
+    A variant that the protocol cannot train, with the figure's own settings, is listed as refused.
+    """
     description = load_figure(figure)
     check_choice("scale", scale, choices("scale"))
+    check_choice("protocol", protocol, choices("protocol"))
     for setting in settings:
         if (key := setting.partition("=")[0]) in FIXED:
             raise ConfigError(f"set {key}", setting.partition("=")[2], f"{figure} and the sweep's options decide {key}")
-    seeds = yaml.safe_load((CONF / "scale" / f"{scale}.yaml").read_text())["seeds"]
-    committed = set() if fresh else committed_runs(figure, scale)
+    edition = Edition.of(scale, protocol, settings)
+    seeds = seeds_of(edition)
+    committed = set() if fresh else committed_runs(figure, edition)
     left_out = description.get("not_trained", {}).get(scale, [])
-    entries = []
+    entries, refused = [], []
     for env in (env for env in description["environments"] if env not in left_out):
         label, of_env = env_label(env), description.get("environment_settings", {}).get(env, [])
         for variant, what in description["variants"].items():
             if env not in what.get("environments", [env]):
                 continue
-            chosen = [f"env={env}", f"algo={what['algo']}", f"scale={scale}"]
+            chosen = [f"env={env}", f"algo={what['algo']}", f"scale={scale}", f"protocol={protocol}"]
             kind = what.get("kind", description.get("kind"))
             of_scale = what.get("scale_settings", {}).get(scale, [])
-            first = compose_run([*chosen, *of_env, *what.get("settings", []), *of_scale, *settings], runs_dir)
+            own = [*chosen, *of_env, *what.get("settings", []), *of_scale]
+            if protocol != PAPER and (why := refusal(own)):
+                refused.append({"env": env, "env_label": label, "variant_label": what["label"], "why": why})
+                continue
+            first = compose_run([*own, *settings], runs_dir)
             if kind is not None:
                 evaluation = description["evaluation"] if kind == "evaluate" else None
                 first = dataclasses.replace(first, kind=kind, evaluation=evaluation)
@@ -175,7 +190,25 @@ def make_plan(figure: str, scale: str, settings: Sequence[str], fresh: bool, run
                 if state != "finished" and run.run_id in committed:
                     state = "committed"
                 entries.append(Entry(run, label, variant, what["label"], state))
-    return Plan(figure, scale, description, fresh, entries)
+    return Plan(figure, edition, description, fresh, entries, refused)
+
+
+def seeds_of(edition: Edition) -> int:
+    """Seeds of every variant: the protocol's number, or the scale's where it has none."""
+    protocol, scale = (
+        yaml.safe_load((CONF / group / f"{name}.yaml").read_text())
+        for group, name in (("protocol", edition.protocol), ("scale", edition.scale))
+    )
+    return protocol.get("seeds", {}).get(edition.scale, scale["seeds"])
+
+
+def refusal(settings: Sequence[str]) -> str:
+    """Why no run can have these settings, empty where one can."""
+    try:
+        compose_run(settings)
+    except ConfigError as error:
+        return str(error)
+    return ""
 
 
 def summary(plan: Plan) -> str:
@@ -183,11 +216,21 @@ def summary(plan: Plan) -> str:
     states = Counter(e.state for e in {e.run.run_id: e for e in plan.entries}.values())
     counts = ", ".join(f"{number} {state}" for state, number in sorted(states.items()))
     todo, table = plan.todo(), costs.known()
-    return (
-        f"{plan.figure} at scale {plan.scale}: {sum(states.values())} runs ({counts}); to train: {len(todo)} runs, "
+    lines = [
+        f"{plan.figure} at {plan.edition}: {sum(states.values())} runs ({counts}); to train: {len(todo)} runs, "
         f"{sum(run.env_steps for run in todo):,} environment steps, "
         f"about {duration(sum(costs.seconds(run, table) for run in todo))} on one core"
-    )
+    ]
+    return "\n".join([*lines, *refused_lines([plan])])
+
+
+def refused_lines(plans: Sequence[Plan]) -> list[str]:
+    """A line per variant that its protocol cannot train."""
+    return [
+        f"{plan.figure}: not trained under the {plan.edition.protocol} protocol: {label} ({why})"
+        for plan in plans
+        for label, why in {each["variant_label"]: each["why"] for each in plan.refused}.items()
+    ]
 
 
 COLUMNS = (
@@ -222,7 +265,7 @@ def overview(plans: Sequence[Plan], workers: int) -> str:
         f"wall-clock with {workers} processes: at least {duration(max([seconds / workers, *chains]))}",
         f"seconds per step measured on {costs.cpu_name()}, {', '.join(days)} ({costs.cache_file()})",
     ]
-    return "\n".join([_row(COLUMNS), *lines, *notes])
+    return "\n".join([_row(COLUMNS), *lines, *notes, *refused_lines(plans)])
 
 
 def _state(run: Run, fresh: bool) -> str:

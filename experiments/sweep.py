@@ -11,6 +11,7 @@ import argparse
 import functools
 import math
 import os
+import shlex
 import shutil
 import signal
 import sys
@@ -23,7 +24,7 @@ from experiments.command_line import EXIT_FAILED, EXIT_NOT_AGREED, EXIT_REQUEUE,
 from experiments.config import Run, check_choice, choices
 from experiments.console import unattended
 from experiments.launchers import run_locally
-from experiments.plan import Plan, make_plan, overview, summary, trained_at
+from experiments.plan import Plan, make_plan, overview, refused_lines, summary, trained_at
 from experiments.status import DONE, NoLocks, check_locks, read_status
 from hippo.core.settings import ConfigError
 
@@ -125,6 +126,8 @@ def run_figure(plan: Plan, todo: Sequence[Run], train: TrainAll, runs_dir: Path)
     if todo:
         start_of_line = "\r" if terminal else ""
         print(f"{start_of_line}[{len(todo)}/{len(todo)}] done in {clock(time.monotonic() - started)}")
+    if plan.edition.overrides:
+        print(f"with overrides, a figure of its own: {drawing(plan)} --runs-dir {shlex.quote(str(runs_dir))}")
     return name_failures(plan, todo, states)
 
 
@@ -182,7 +185,7 @@ def status_table(plan: Plan, waiting: dict[str, str]) -> str:
     to_retry = may_retry(plan)
     if to_retry:
         lines.append(
-            f"{len(to_retry)} to try again: python -m experiments.sweep retry {plan.figure} --scale {plan.scale}"
+            f"{len(to_retry)} to try again: python -m experiments.sweep retry {plan.figure} {plan.edition.options}"
         )
     return "\n".join(lines)
 
@@ -204,6 +207,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("action", choices=tuple(ACTIONS))
     parser.add_argument("figure", help="a figure or table of conf/figure; `plan` and `write` also take all")
     parser.add_argument("--scale", default="smoke", help="smoke, laptop or paper")
+    parser.add_argument("--protocol", default="paper", help="paper or modern")
     parser.add_argument("--launcher", default="local", help=", ".join(LAUNCHERS))
     parser.add_argument("--workers", type=int, default=len(os.sched_getaffinity(0)), help="processes, one thread each")
     parser.add_argument("--profile", type=Path, help="slurm: what jobs ask for (default: conf/slurm/default.yaml)")
@@ -230,7 +234,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parse(arguments)
 
     def plan_of(figure: str) -> Plan:
-        plan = make_plan(figure, options.scale, options.set, options.fresh, options.runs_dir)
+        plan = make_plan(figure, options.scale, options.set, options.fresh, options.runs_dir, options.protocol)
         plan = plan.within(options.env) if options.env and plan.entries else plan
         plan = plan.by_seed() if options.order == "seeds" else plan
         return plan.only(options.only) if options.only else plan
@@ -289,7 +293,11 @@ def run_or_retry(options: argparse.Namespace, plan_of: Callable[[str], Plan]) ->
     """`run` and `retry`; what costs much is started only if it was agreed to, else nothing is written."""
     plan = plan_of(options.figure)
     if not plan.entries:
-        print(f"{plan.figure}: not trained at scale {plan.scale}, only at {', '.join(trained_at(plan.description))}")
+        print(
+            f"{plan.figure}: not trained at {plan.edition}, only at {', '.join(trained_at(plan.description))}",
+            *refused_lines([plan]),
+            sep="\n",
+        )
         plan.write(options.runs_dir)
         return 0
     todo = plan.todo() if options.action == "run" else may_retry(plan)
@@ -321,14 +329,22 @@ def ask(plan: Plan, runs: int, hours: float, options: argparse.Namespace) -> str
 
     The number is that of the committed reference costs, so that the answer is the same on every machine, every time.
     """
-    target = f"make {plan.figure} SCALE={plan.scale}"
+    target, variables = plan.figure, plan.edition.variables
+    overridden = bool(plan.edition.overrides)  # make knows none
+    agree = "--yes" if overridden else f"make {target} {variables} YES=1, or --yes"
+    draw = drawing(plan) if overridden else f"make draw-{target} {variables}"
     return (
-        f"not started: {plan.figure} at scale {plan.scale} has {runs} runs to train, about {hours:,.1f} core-hours; "
+        f"not started: {target} at {plan.edition} has {runs} runs to train, about {hours:,.1f} core-hours; "
         f"from {options.max_core_hours:g} on (--max-core-hours) you are asked\n"
         f"  estimate: environment steps times the committed seconds per step ({costs.reference_source()}); "
-        f"make plan-{plan.figure} SCALE={plan.scale} measures this machine\n"
-        f"  to agree: {target} YES=1, or --yes; without training: make draw-{plan.figure} SCALE={plan.scale}"
+        f"make plan-{target} {variables} measures this machine\n"
+        f"  to agree: {agree}; without training: {draw}"
     )
+
+
+def drawing(plan: Plan) -> str:
+    """The command that draws a plan, which is the only one for a plan with overrides."""
+    return f"python -m paper_figures.{plan.figure} {plan.edition.options}"
 
 
 ACTIONS = {

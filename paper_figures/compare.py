@@ -1,4 +1,4 @@
-"""Learning curves of any runs beside each other, of one scale and one physics per environment.
+"""Learning curves of any runs beside each other, of one scale, protocol and physics per environment.
 
     python -m paper_figures.compare runs/<run_id> runs/<run_id> ...
 
@@ -16,13 +16,14 @@ from typing import Any
 import pandas as pd
 import yaml
 
+from analysis.edition import PAPER, Edition
 from analysis.runs import COLUMNS, Results, read_commits, read_progress
 from paper_figures import curves
 from paper_figures.command_line import BAD_INPUT, HERE, SMOOTH, share
 
 
 def planned(folder: Path) -> dict[str, Any]:
-    """A run folder as a plan describes its runs, and its `scale`.
+    """A run folder as a plan describes its runs, and its `scale` and `protocol`.
 
     Raises:
         ValueError: it is none of a training run.
@@ -39,24 +40,25 @@ def planned(folder: Path) -> dict[str, Any]:
     budget = {key: identity[key] for key in ("env", "seed", "iterations", "batch_size")}
     labels = {"env_label": identity["env"].replace("_", " ").title(), "variant": label, "variant_label": label}
     rest = {"physics": identity["options"].get("physics", "paper"), "kind": "train", "state": "finished"}
-    return {"run_id": manifest["run_id"], "scale": config["scale"]} | budget | labels | rest
+    edition = {"scale": config["scale"], "protocol": config.get("protocol", PAPER)}
+    return {"run_id": manifest["run_id"]} | edition | budget | labels | rest
 
 
 def gather(folders: Sequence[Path]) -> Results:
     """The runs in `folders` as the results of one figure.
 
     Raises:
-        ValueError: a folder holds no training run or no row yet; runs of two scales, or of two kinds of physics.
+        ValueError: a folder holds no training run or no row yet; runs of two scales, protocols or kinds of physics.
     """
     runs = {run["run_id"]: run | {"folder": folder} for folder in folders for run in [planned(folder)]}
-    for key, of in (("scale", ""), ("physics", "env")):
+    for key, of in (("scale", ""), ("protocol", ""), ("physics", "env")):
         groups: dict[str, set[str]] = {}
         for run in runs.values():
             groups.setdefault(run[of] if of else "the runs", set()).add(run[key])
         for name, values in groups.items():
             if len(values) > 1:
                 raise ValueError(f"{name}: of more than one {key} ({', '.join(sorted(values))}), never drawn together")
-    scale = next(iter(runs.values()))["scale"]
+    edition = {key: next(iter(runs.values()))[key] for key in ("scale", "protocol")}
     parts, missing = [], []
     for run in runs.values():
         rows = read_progress(run.pop("folder") / "progress.csv", ["return_mean"])
@@ -66,7 +68,8 @@ def gather(folders: Sequence[Path]) -> Results:
     frame = pd.concat([rows for rows in parts if len(rows)] or parts, ignore_index=True)[COLUMNS]
     if frame.empty:
         raise ValueError("runs: none of them has a row yet")
-    plan = {"figure": "compare", "scale": scale, "title": "Runs beside each other", "runs": list(runs.values())}
+    title = ", ".join(["Runs beside each other", *Edition.planned(edition).marks])
+    plan = {"figure": "compare", **edition, "title": title, "runs": list(runs.values())}
     return Results(plan, frame, missing, read_commits(folders[0].parent, sorted(runs)))
 
 

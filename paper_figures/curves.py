@@ -20,6 +20,7 @@ from matplotlib.offsetbox import AnchoredOffsetbox, HPacker, TextArea
 from matplotlib.patheffects import withStroke
 
 from analysis import stats
+from analysis.edition import PAPER, Edition
 from analysis.runs import Results, scores
 from paper_figures import command_line, style
 
@@ -31,6 +32,13 @@ NOT_A_RESULT = {"smoke": "smoke"}  # scales whose pictures say nothing about the
 def unique(results: Results, key: str) -> dict[str, str]:
     """Environments or trained variants of the plan, in its order: name -> label."""
     return {run[key]: run[f"{key}_label"] for run in results.plan["runs"] if run["kind"] == "train"}
+
+
+def watermark(edition: Edition) -> str:
+    """What is written across a picture that is no result of the suite, and under which protocol; else nothing."""
+    smoke, overridden = NOT_A_RESULT.get(edition.scale, ""), "overridden" if edition.overrides else ""
+    protocol = "" if edition.protocol == PAPER else edition.protocol
+    return "\n".join(line for line in (smoke, overridden, protocol) if line) if smoke or overridden else ""
 
 
 def window_of(iterations: int, share: float) -> int:
@@ -149,6 +157,8 @@ def left_out(results: Results, extra: "Extra | None") -> str:
             reasons.setdefault("no results yet", []).append(label)
         elif extra is not None and (reason := extra.absent(results, env)):
             reasons.setdefault(f"{extra.label}: {reason}", []).append(label)
+    for label in dict.fromkeys(each["variant_label"] for each in results.plan.get("refused", [])):
+        reasons.setdefault(f"not trained under the {results.edition.protocol} protocol", []).append(label)
     for each in results.plan.get("not_trained", []):
         reasons.setdefault("not trained at this scale", []).append(each["env_label"])
     return "; ".join(f"{', '.join(labels)} ({reason})" for reason, labels in reasons.items())
@@ -211,7 +221,9 @@ def picture(results: Results, share: float, extra: Extra | None, columns: int, w
     with_extra = [env for env in environments if extra is not None and not extra.absent(results, env)]
     curve_rows, extra_rows = (-(-len(envs) // columns) for envs in (environments, with_extra))
     legend_rows, legend_columns = legend_shape(list(variants.values()), width)
-    note = textwrap.wrap(f"Not shown: {text}." if (text := left_out(results, extra)) else "", int(width * 19))
+    sentences = [*results.edition.marks, *([f"not shown: {text}"] if (text := left_out(results, extra)) else [])]
+    letters = int(width * 19)
+    note = [line for each in sentences for line in textwrap.wrap(f"{each[0].upper()}{each[1:]}.", letters)]
     height = (curve_rows + extra_rows) * (2.6 if columns < 3 else 2.25) + 0.2 + 0.16 * (legend_rows + len(note))
     figure, grid = plt.subplots(
         curve_rows + extra_rows, columns, figsize=(width, height), squeeze=False, layout="constrained"
@@ -239,8 +251,8 @@ def picture(results: Results, share: float, extra: Extra | None, columns: int, w
     figure.legend(handles=handles, loc="outside upper center", ncols=legend_columns, columnspacing=1.2)
     if note:
         figure.supxlabel("\n".join(note), fontsize=6.5, color="#555555")
-    if results.plan["scale"] in NOT_A_RESULT:
-        style.watermark(figure, NOT_A_RESULT[results.plan["scale"]])
+    if stamp := watermark(results.edition):
+        style.watermark(figure, stamp)
     return figure
 
 
@@ -266,7 +278,7 @@ def draw(results: Results, out: Path, extra: Extra | None = None, share: float =
     style.use()
     plan = results.plan
     panels = sum(bool(seeds_behind(results, env)) for env in unique(results, "env"))
-    stem = out / plan["scale"] / plan["figure"]
+    stem = results.stem(out)
     columns = min(4, panels)
     wide = picture(results, share, extra, columns, style.WIDTH * min(1, (columns + 1) / 3))
     title = f"{plan['figure']}: {plan['title']}"

@@ -8,6 +8,7 @@ import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
 
+from analysis.edition import chosen
 from paper_figures import style
 from paper_figures.command_line import parse
 
@@ -92,7 +93,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     style.use()
     figure, axes = plt.subplots(figsize=(style.WIDTH, 3.1), layout="constrained")
     draw(axes)
-    stem = options.out / options.scale / "fig1"
+    stem = options.out / chosen(options).folder / "fig1"
     written = style.save(figure, style.formats(stem), TITLE, "no data: a diagram")
     figure, rows = plt.subplots(2, 1, figsize=(style.NARROW, 5.2), layout="constrained")
     for axes, half in zip(rows, HALVES, strict=True):

@@ -11,6 +11,7 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 
+from analysis.edition import chosen
 from hippo.envs import make
 from hippo.envs.rendering import NoOpenGL, Renderer
 from paper_figures import style
@@ -66,7 +67,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         FRAMES.mkdir(parents=True, exist_ok=True)
         for name, picture in pictures.items():
             plt.imsave(FRAMES / f"{name}.png", picture)
-    stem, written = options.out / options.scale / "fig2", []
+    stem, written = options.out / chosen(options).folder / "fig2", []
     for shape, size, paths in (
         ((1, 4), (style.WIDTH, 1.6), style.formats(stem)),
         ((4, 1), (style.NARROW, 12.0), [style.narrow(stem)]),

@@ -68,9 +68,18 @@ def use() -> None:
 
 
 def watermark(figure: Figure, text: str) -> None:
-    """Write `text` large and pale across the figure."""
+    """Write `text` large and pale across the figure, smaller where a line is long."""
     figure.text(
-        0.5, 0.42, text, fontsize=80, color="#BBBBBB", alpha=0.35, ha="center", va="center", rotation=18, zorder=0
+        0.5,
+        0.42,
+        text,
+        fontsize=min(80, 400 / max(map(len, text.splitlines()))),
+        color="#BBBBBB",
+        alpha=0.35,
+        ha="center",
+        va="center",
+        rotation=18,
+        zorder=0,
     )
 
 

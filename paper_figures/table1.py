@@ -91,7 +91,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def write(results: Results, options: argparse.Namespace) -> str:
     """Write the files; returns the table."""
-    stem = options.out / options.scale / "table1"
+    stem = results.stem(options.out)
     episodes = results.frame.groupby(["run_id", "metric"]).size().max()
     scale = " It says nothing about the methods." if options.scale == "smoke" else ""
     note = f"Scale: {options.scale}.{scale} {episodes} stochastic episodes per seed. {NOTE} From {results.origin()}."

@@ -79,7 +79,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def write(results: Results, options: argparse.Namespace) -> str:
     """Write the files; returns the table."""
-    table, stem = rows(results), options.out / options.scale / "table2"
+    table, stem = rows(results), results.stem(options.out)
     scale = " It says nothing about the methods." if options.scale == "smoke" else ""
     note = f"Scale: {options.scale}.{scale} From {results.origin()}."
     comment = results.provenance()

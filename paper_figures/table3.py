@@ -5,6 +5,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from analysis.edition import chosen
 from paper_figures import command_line, tabular
 
 LEDGER = Path(__file__).parent.parent / "docs" / "hyperparameters.csv"
@@ -18,7 +19,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = command_line.parse("table3", arguments)
     with LEDGER.open() as file:
         table = [{key: row[key] for key in row if key != "meaning"} for row in csv.DictReader(file)]
-    stem = options.out / options.scale / "table3"
+    stem = options.out / chosen(options).folder / "table3"
     tabular.write(stem, "Hyper-parameters", NOTE, table, "from docs/hyperparameters.csv; no runs")
     stem.with_suffix(".csv").write_text(LEDGER.read_text())
     print(f"{len(table)} settings; wrote {stem}.csv {stem}.md {stem}.tex")

@@ -183,7 +183,7 @@ def test_two_scales_are_never_drawn_together(tmp_path):
         runs.load("fig3", "smoke", tmp_path, tmp_path / "data")
     (tmp_path / "plans/paper").mkdir()
     (tmp_path / "plans/smoke/fig3.json").rename(tmp_path / "plans/paper/fig3.json")
-    with pytest.raises(ValueError, match="a plan of scale smoke, not of paper"):
+    with pytest.raises(ValueError, match="a plan of scale smoke, not of scale paper"):
         runs.load("fig3", "paper", tmp_path, tmp_path / "data")
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from analysis import claims, report
-from analysis.command_line import SCALES
+from analysis.command_line import PROTOCOLS, SCALES
 from experiments import sweep, synonyms, train
 from experiments.config import (
     ALGORITHMS,
@@ -254,5 +254,6 @@ def test_a_scale_that_does_not_exist_is_refused_by_every_command(command, scale,
     assert not list(here.iterdir())
 
 
-def test_the_scales_of_the_analysis_are_those_that_are_trained():
+def test_the_scales_and_protocols_of_the_analysis_are_those_that_are_trained():
     assert sorted(SCALES) == choices("scale")
+    assert sorted(PROTOCOLS) == choices("protocol")

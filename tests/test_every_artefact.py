@@ -7,7 +7,9 @@ from pathlib import Path
 
 import pytest
 import torch
+from PIL import Image
 
+from analysis.edition import Edition
 from experiments import config, plan
 from experiments.train import execute
 
@@ -21,6 +23,7 @@ seeds: 1
 off_policy: {iterations: 2, batch_size: 40}
 budget:
 """
+OVERRIDES = ["algo.gamma=0.9", "algo.clip_range=0.2"]
 FIGURES = sorted(path.stem for path in (config.CONF / "figure").glob("*.yaml"))
 ARTEFACTS = sorted(path.stem for stem in ("fig", "table") for path in (ROOT / "paper_figures").glob(f"{stem}[0-9]*.py"))
 
@@ -46,15 +49,19 @@ def runs(tmp_path_factory):
             states = {run.run_id: execute(run) for run in todo}
             assert set(states.values()) <= {"finished"}, (figure, states)
             plan.make_plan(figure, SCALE, [], True, folder / "runs").write(folder / "runs")
+        for settings, protocol in ((OVERRIDES, "paper"), ([], "modern")):  # a run of each method is enough
+            again = plan.make_plan("fig3", SCALE, settings, True, folder / "runs", protocol).within(["block_hopper"])
+            assert {execute(run) for run in again.todo()} == {"finished"}
+            plan.make_plan("fig3", SCALE, settings, True, folder / "runs", protocol).write(folder / "runs")
     config._base.cache_clear()
     torch.set_num_threads(threads)
     torch.use_deterministic_algorithms(False)
     return folder / "runs"
 
 
-def made(module, runs, out, monkeypatch):
+def made(module, runs, out, monkeypatch, *more):
     """Run `python -m module` for the tiny scale in this process; its exit code."""
-    arguments = [module, "--scale", SCALE, "--runs-dir", str(runs), "--out", str(out)]
+    arguments = [module, "--scale", SCALE, "--runs-dir", str(runs), "--out", str(out), *more]
     monkeypatch.setattr(sys, "argv", arguments)
     monkeypatch.delitem(sys.modules, module, raising=False)  # another test may have imported it
     with pytest.raises(SystemExit) as end:
@@ -81,6 +88,51 @@ def test_it_is_made_of_the_runs_of_its_plan(artefact, runs, tmp_path, monkeypatc
         first = [(tmp_path / SCALE / f"{artefact}{kind}").read_bytes() for kind in kinds]
         assert made(f"paper_figures.{artefact}", runs, tmp_path, monkeypatch) == 0
         assert [(tmp_path / SCALE / f"{artefact}{kind}").read_bytes() for kind in kinds] == first
+
+
+def test_another_protocol_has_folders_captions_and_titles_of_its_own(runs, tmp_path, monkeypatch, capsys):
+    assert made("paper_figures.fig3", runs, tmp_path, monkeypatch) == 0
+    before = contents(tmp_path)
+    for module in ("paper_figures.fig3", "paper_figures.fig1", "analysis.claims", "analysis.report"):
+        assert made(module, runs, tmp_path, monkeypatch, "--protocol", "modern") == 0
+    new = {path: content for path, content in contents(tmp_path).items() if before.get(path) != content}
+    assert {path.parent for path in new} == {tmp_path / "modern" / SCALE}
+    assert {"fig3.png", "fig1.png", "claims.md", "report.html"} <= {path.name for path in new}
+    caption = new[tmp_path / "modern" / SCALE / "fig3.caption.txt"].decode()
+    assert "time commitments, modern protocol. Scale: tiny." in caption
+    assert (
+        f"HiPPO reproduction, {SCALE} scale, modern protocol".encode()
+        in new[tmp_path / "modern" / SCALE / "report.html"]
+    )
+    with Image.open(tmp_path / "modern" / SCALE / "fig3.png") as picture:
+        assert picture.info["Title"].endswith(", modern protocol")
+    capsys.readouterr()
+    assert made("paper_figures.fig4", runs, tmp_path, monkeypatch, "--protocol", "modern") == 3
+    assert f"make draw-fig4 SCALE={SCALE} PROTOCOL=modern" in capsys.readouterr().err
+
+
+def contents(folder):
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_a_figure_with_overrides_says_so_everywhere_and_touches_no_file_of_the_unmodified_one(
+    runs, tmp_path, monkeypatch
+):
+    assert made("paper_figures.fig3", runs, tmp_path, monkeypatch) == 0
+    before, flags = contents(tmp_path), [word for setting in OVERRIDES for word in ("--set", setting)]
+    assert made("paper_figures.fig3", runs, tmp_path, monkeypatch, *flags) == 0
+    after = contents(tmp_path)
+    assert before.items() <= after.items()
+    name = Edition.of(SCALE, settings=OVERRIDES).name("fig3")
+    stem = tmp_path / SCALE / "overridden" / name
+    assert {path for path in after if path not in before} == {
+        stem.with_name(f"{name}.{kind}") for kind in ("csv", "png", "pdf", "svg", "caption.txt")
+    }
+    said = "overridden: algo.clip_range=0.2, algo.gamma=0.9"
+    assert said in after[stem.with_suffix(".caption.txt")].decode()
+    with Image.open(stem.with_suffix(".png")) as picture:
+        assert said in picture.info["Title"]
+    assert {line.split(",")[0] for line in after[stem.with_suffix(".csv")].decode().splitlines()[1:]} == {name}
 
 
 def test_one_seed_gives_no_verdict_and_all_of_it_fits_on_one_page(runs, tmp_path, monkeypatch, capsys):

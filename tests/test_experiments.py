@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 
+from analysis.edition import Edition
 from experiments import costs, launchers, sweep, train
 from experiments.config import COMMITTED, Run, compose_run
 from experiments.plan import Plan, committed_runs, make_plan
@@ -270,10 +271,16 @@ def tiny_figure(monkeypatch):
     return ["run", "tiny", "--set", "iterations=2", "--set", "batch_size=400"]
 
 
+def overridden(runs_dir, figure):
+    """The only plan with overrides of a figure."""
+    (path,) = (runs_dir / "plans/smoke/overridden").glob(f"{figure}+????????.json")
+    return json.loads(path.read_text())
+
+
 def test_a_sweep_trains_what_is_missing_once_and_writes_its_plan(tiny_figure, tmp_path, capsys):
     arguments = [*tiny_figure, "--runs-dir", str(tmp_path)]
     assert sweep.main(arguments) == 0
-    plan = json.loads((tmp_path / "plans/smoke/tiny.json").read_text())
+    plan = overridden(tmp_path, "tiny")
     assert [r["state"] for r in plan["runs"]] == ["finished"] * 4
     assert {(r["variant"], r["seed"]) for r in plan["runs"]} == {(v, s) for v in ("hippo", "ppo") for s in (0, 1)}
     stamps = {r["run_id"]: (tmp_path / r["run_id"] / "progress.csv").stat().st_mtime_ns for r in plan["runs"]}
@@ -289,7 +296,7 @@ def test_a_sweep_trains_what_is_missing_once_and_writes_its_plan(tiny_figure, tm
 def test_a_measurement_trains_its_parent_first_and_shares_it(tmp_path, capsys):
     settings = ["--set", "iterations=1", "--set", "batch_size=400", "--set", "env.horizon=50"]
     assert sweep.main(["run", "table2", *settings, "--runs-dir", str(tmp_path)]) == 0
-    plan = json.loads((tmp_path / "plans/smoke/table2.json").read_text())
+    plan = overridden(tmp_path, "table2")
     assert {(r["kind"], r["state"]) for r in plan["runs"]} == {("measure", "finished")}
     ids = {r["run_id"] for r in plan["runs"]}
     parents = {p.name for p in tmp_path.iterdir() if (p / "checkpoint.pt").exists()}
@@ -394,7 +401,7 @@ def test_a_stop_whose_exception_was_lost_is_heard_at_the_next_report(number, tmp
             report([], 0)
         return {}
 
-    plan = Plan("fig3", "smoke", {}, fresh=True, entries=[])
+    plan = Plan("fig3", Edition("smoke"), {}, fresh=True, entries=[])
     assert sweep.run_figure(plan, [], train, tmp_path) == 75
     assert "the same command continues" in capsys.readouterr().err
     assert signal.getsignal(number) is handler
@@ -424,4 +431,4 @@ def test_a_progress_line_names_the_runs_in_progress_with_their_last_return(tiny_
 def test_every_committed_row_belongs_to_a_run_that_its_plan_still_yields():
     for path in COMMITTED.glob("*/fig*.csv"):
         plan = make_plan(path.stem, path.parent.name, [], True, Path("runs"))
-        assert committed_runs(path.stem, path.parent.name) <= {e.run.run_id for e in plan.entries}
+        assert committed_runs(path.stem, Edition(path.parent.name)) <= {e.run.run_id for e in plan.entries}

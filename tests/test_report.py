@@ -9,7 +9,8 @@ import pytest
 from markdown_it import MarkdownIt
 
 from analysis import report
-from analysis.report_data import Table, gather, markdown_table, natural, scales
+from analysis.edition import Edition
+from analysis.report_data import Table, folders, gather, markdown_table, natural
 from analysis.runs import Results
 from paper_figures import table2, tabular
 from tests.report import artefacts
@@ -28,7 +29,7 @@ def pages(root):
 
 def facts(root):
     """The report's data."""
-    return gather("smoke", root / "runs", root / "data", root / "out")
+    return gather(Edition("smoke"), root / "runs", root / "data", root / "out")
 
 
 def rendered(markdown):
@@ -261,7 +262,7 @@ def test_with_nothing_to_report_there_is_one_line_and_exit_code_2(tmp_path, caps
     assert report.main(arguments(tmp_path)) == 2
     said = capsys.readouterr()
     assert said.err.count("\n") == 1
-    assert "scale=smoke" in said.err
+    assert "scale smoke: nothing" in said.err
     assert "make draw-all SCALE=smoke" in said.err
     assert said.out == ""
     assert not (tmp_path / "out").exists()
@@ -269,12 +270,12 @@ def test_with_nothing_to_report_there_is_one_line_and_exit_code_2(tmp_path, caps
     assert report.main(arguments(tmp_path)) == 2
     artefacts.picture(tmp_path / "out/smoke/fig1.png", "fig1: x")
     assert report.main([*arguments(tmp_path), "--scale", "paper"]) == 2
-    assert "(scales that have something: smoke)" in capsys.readouterr().err
+    assert "(there is something in: smoke)" in capsys.readouterr().err
     (tmp_path / "out/laptop").mkdir()
-    assert scales(tmp_path / "runs", tmp_path / "out") == ["smoke"]
+    assert folders(tmp_path / "runs", tmp_path / "out") == ["smoke"]
     artefacts.plan(tmp_path, "fig3", [])
     (tmp_path / "runs/plans/smoke").rename(tmp_path / "runs/plans/paper")
-    assert scales(tmp_path / "runs", tmp_path / "out") == ["paper", "smoke"]
+    assert folders(tmp_path / "runs", tmp_path / "out") == ["paper", "smoke"]
 
 
 @pytest.mark.parametrize(

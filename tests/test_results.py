@@ -7,11 +7,14 @@ import pandas as pd
 import pytest
 
 from analysis import results
+from analysis.command_line import PROTOCOLS
+from analysis.edition import Edition
 from analysis.runs import COLUMNS
 from experiments.plan import make_plan
 from tests.test_analysis import planned
 
 ROOT = Path(__file__).parent.parent
+EDITIONS = [Edition(scale, protocol) for protocol in PROTOCOLS for scale in results.SCALES]
 
 
 def committed(tmp_path, scale="laptop"):
@@ -53,16 +56,16 @@ def test_rows_without_a_plan_are_one_clear_error(tmp_path, capsys):
 
 
 def test_the_committed_page_is_fresh(tmp_path):
-    for scale in results.SCALES:
-        for path in sorted((results.DATA / scale).glob("*.csv")):
-            make_plan(path.stem, scale, [], False, tmp_path).write(tmp_path)
+    for edition in EDITIONS:
+        for path in sorted((results.DATA / edition.folder).glob("*.csv")):
+            make_plan(path.stem, edition.scale, [], False, tmp_path, edition.protocol).write(tmp_path)
     written = (ROOT / "docs" / "results.md").read_text()
     assert results.page(tmp_path, results.DATA, ROOT / "docs" / "pictures") == written, "run `make results`"
 
 
-@pytest.mark.parametrize("scale", results.SCALES)
-def test_every_committed_row_belongs_to_a_planned_run(scale, tmp_path):
-    for path in sorted((results.DATA / scale).glob("*.csv")):
-        plan = make_plan(path.stem, scale, [], False, tmp_path)
+@pytest.mark.parametrize("edition", EDITIONS, ids=str)
+def test_every_committed_row_belongs_to_a_planned_run(edition, tmp_path):
+    for path in sorted((results.DATA / edition.folder).glob("*.csv")):
+        plan = make_plan(path.stem, edition.scale, [], False, tmp_path, edition.protocol)
         ids = set(pd.read_csv(path, dtype={"run_id": str})["run_id"])
         assert ids <= {entry.run.run_id for entry in plan.entries}

@@ -111,7 +111,8 @@ def test_a_sweep_survives_a_kill_a_cancellation_and_a_restarted_node(long_run, c
     assert sweep.main(["retry", *on_slurm]) == 0
     assert set(slurm.queued(runs_dir)) >= {killed.run_id, cancelled.run_id}
     assert sweep.main(["run", *on_slurm, "--wait"]) == 0
-    plan = json.loads((runs_dir / "plans/smoke/tiny.json").read_text())
+    (path,) = (runs_dir / "plans/smoke/overridden").glob("tiny+*.json")
+    plan = json.loads(path.read_text())
     assert {run["state"] for run in plan["runs"]} == {"finished"}
 
     local = [dataclasses.replace(run, runs_dir=tmp_path / "local") for run in runs]
