@@ -155,7 +155,7 @@ def make_plan(
 ) -> Plan:
     """Resolve a figure into runs and look up how each is doing.
 
-    A variant that the protocol cannot train, with the figure's own settings, is listed as refused.
+    A variant one of whose own settings cannot be had under the protocol is listed as refused.
     """
     description = load_figure(figure)
     check_choice("scale", scale, choices("scale"))
@@ -176,11 +176,13 @@ def make_plan(
             chosen = [f"env={env}", f"algo={what['algo']}", f"scale={scale}", f"protocol={protocol}"]
             kind = what.get("kind", description.get("kind"))
             of_scale = what.get("scale_settings", {}).get(scale, [])
-            own = [*chosen, *of_env, *what.get("settings", []), *of_scale]
-            if protocol != PAPER and (why := refusal(own)):
-                refused.append({"env": env, "env_label": label, "variant_label": what["label"], "why": why})
+            try:
+                first = compose_run([*chosen, *of_env, *what.get("settings", []), *of_scale, *settings], runs_dir)
+            except ConfigError as error:
+                if protocol == PAPER or f"{error.key}={error.value}" not in what.get("settings", []):
+                    raise
+                refused.append({"env": env, "env_label": label, "variant_label": what["label"], "why": str(error)})
                 continue
-            first = compose_run([*own, *settings], runs_dir)
             if kind is not None:
                 evaluation = description["evaluation"] if kind == "evaluate" else None
                 first = dataclasses.replace(first, kind=kind, evaluation=evaluation)
@@ -200,15 +202,6 @@ def seeds_of(edition: Edition) -> int:
         for group, name in (("protocol", edition.protocol), ("scale", edition.scale))
     )
     return protocol.get("seeds", {}).get(edition.scale, scale["seeds"])
-
-
-def refusal(settings: Sequence[str]) -> str:
-    """Why no run can have these settings, empty where one can."""
-    try:
-        compose_run(settings)
-    except ConfigError as error:
-        return str(error)
-    return ""
 
 
 def summary(plan: Plan) -> str:

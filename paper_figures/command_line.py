@@ -16,7 +16,9 @@ BAD_INPUT, NOTHING_YET = 2, 3  # exit codes
 def parse(artefact: str, arguments: Sequence[str] | None) -> argparse.Namespace:
     """scale, protocol, set, runs_dir, data, out and smooth of one figure or table."""
     made = parser(f"paper_figures.{artefact}", f"Make {artefact}.")
-    made.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="what was overridden in every run")
+    made.add_argument(
+        "--set", action="append", default=[], metavar="KEY=VALUE", help="what was overridden in every run"
+    )
     made.add_argument("--smooth", type=share, default=SMOOTH, help="learning curves: moving mean over this share")
     return made.parse_args(arguments)
 

@@ -254,6 +254,21 @@ def test_a_scale_that_does_not_exist_is_refused_by_every_command(command, scale,
     assert not list(here.iterdir())
 
 
+@pytest.mark.parametrize("command", ["claims", "report", "sweep", "train", "fig1", "fig3"])
+def test_so_is_a_protocol_that_does_not_exist(command, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    main, arguments = {
+        "claims": (claims.main, []),
+        "report": (report.main, []),
+        "sweep": (sweep.main, ["write", "fig3"]),
+        "train": (train.main, []),
+    }.get(command, (draw.main, [command]))
+    option = ["protocol=../modern"] if command == "train" else ["--protocol", "../modern"]
+    said = refused(main, [*arguments, *option], capsys)
+    assert all(word in said for word in ("protocol", "../modern", *PROTOCOLS))
+    assert not list(tmp_path.iterdir())
+
+
 def test_the_scales_and_protocols_of_the_analysis_are_those_that_are_trained():
     assert sorted(SCALES) == choices("scale")
     assert sorted(PROTOCOLS) == choices("protocol")

@@ -151,7 +151,7 @@ def test_all_goes_on_to_the_tables_whatever_becomes_of_a_figure():
 
 def test_help_lists_every_variable_with_a_line():
     said = subprocess.run(["make", "help"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
-    for name in ("SCALE", "LAUNCHER", "PROFILE", "FRESH", "YES", "RUNS_DIR", "WORKERS"):
+    for name in ("SCALE", "PROTOCOL", "LAUNCHER", "PROFILE", "FRESH", "YES", "RUNS_DIR", "WORKERS"):
         (line,) = re.findall(rf"^  {name}=\S+ +(\S.*)$", said, re.MULTILINE)
         assert line
     for target in ("figN", "tableN", "draw-figN", "draw-all", "plan-figN"):

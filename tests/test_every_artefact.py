@@ -37,6 +37,9 @@ def runs(tmp_path_factory):
     budgets = [f"  {task}: {{iterations: 2, batch_size: 40, horizon: 20, physics: fast}}\n" for task in TASKS]
     paper = [line.replace("fast", "paper") if "hopper" in line or "cheetah" in line else line for line in budgets]
     (conf / "scale" / f"{SCALE}.yaml").write_text(YAML + "".join(paper))
+    modern = conf / "protocol/modern.yaml"
+    budget = "".join(f"    {task}: {{iterations: 2, batch_size: 320}}\n" for task in TASKS)  # more than a minibatch
+    modern.write_text(modern.read_text().replace("budget:\n", f"budget:\n  {SCALE}:\n{budget}"))
     for path in (conf / "figure").glob("*.yaml"):  # what makes a figure quick at smoke scale makes it quick here
         path.write_text(path.read_text().replace("smoke:", f"{SCALE}:"))
     threads = torch.get_num_threads()
@@ -63,6 +66,7 @@ def made(module, runs, out, monkeypatch, *more):
     """Run `python -m module` for the tiny scale in this process; its exit code."""
     arguments = [module, "--scale", SCALE, "--runs-dir", str(runs), "--out", str(out), *more]
     monkeypatch.setattr(sys, "argv", arguments)
+    monkeypatch.setattr("analysis.command_line.SCALES", (SCALE,))
     monkeypatch.delitem(sys.modules, module, raising=False)  # another test may have imported it
     with pytest.raises(SystemExit) as end:
         runpy.run_module(module, run_name="__main__")
