@@ -40,7 +40,7 @@ def project(tmp_path_factory):
     for name in COPIED:
         source = ROOT / name
         if source.is_dir():
-            shutil.copytree(source, root / name, ignore=shutil.ignore_patterns("__pycache__", "out"))
+            shutil.copytree(source, root / name, ignore=shutil.ignore_patterns("out"))  # with what numba has compiled
         else:
             shutil.copy(source, root / name)
     environment = os.environ | {"PYTHONPATH": str(root), "XDG_CACHE_HOME": str(root / "cache")}

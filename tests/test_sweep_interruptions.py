@@ -42,11 +42,11 @@ if __name__ == "__main__":  # workers import this file again
 """
 
 
-def start_sweep(tmp_path, iterations, figure=FIGURE):
+def start_sweep(tmp_path, iterations, figure=FIGURE, workers=2):
     """A sweep in a process of its own, of four runs unless `figure` has more."""
     script = tmp_path / "tiny_sweep.py"
     script.write_text(SCRIPT.replace("FIGURE", repr(figure)))
-    arguments = ["run", "tiny", "--runs-dir", str(tmp_path / "runs"), "--workers", "2"]
+    arguments = ["run", "tiny", "--runs-dir", str(tmp_path / "runs"), "--workers", str(workers)]
     settings = ["--set", f"iterations={iterations}", "--set", "batch_size=400"]
     return subprocess.Popen(
         [sys.executable, str(script), *arguments, *settings],
@@ -69,15 +69,15 @@ def tiny_figure(monkeypatch):
 
 
 def test_two_sweeps_started_together_train_every_run_once_and_both_succeed(tmp_path):
-    both = [start_sweep(tmp_path, 6) for _ in range(2)]
+    both = [start_sweep(tmp_path, 3, workers=1) for _ in range(2)]
     errors = [process.communicate(timeout=100)[1] for process in both]
     assert [process.returncode for process in both] == [0, 0], errors
     folders = [path.parent for path in (tmp_path / "runs").glob("*/status.json")]
     assert len(folders) == 4
     for folder in folders:
         assert json.loads((folder / "status.json").read_text())["state"] == "finished"
-        assert (folder / "train.log").read_text().count("iteration 6/6") == 1
-        assert (folder / "progress.csv").read_text().count("\n") == 7
+        assert (folder / "train.log").read_text().count("iteration 3/3") == 1
+        assert (folder / "progress.csv").read_text().count("\n") == 4
     assert not list((tmp_path / "runs").rglob("*.tmp"))
 
 
@@ -92,30 +92,34 @@ def is_worker(process):
         return False
 
 
-def test_six_workers_killed_at_random_leave_no_trace_once_the_command_was_typed_again(tmp_path):
-    (tmp_path / "a").mkdir()
+@pytest.mark.parametrize(
+    ("figure", "kills"), [(FIGURE, 2), pytest.param(EIGHT, 6, marks=pytest.mark.slow)], ids=["two", "six"]
+)
+def test_workers_killed_at_random_leave_no_trace_once_the_command_was_typed_again(figure, kills, tmp_path, monkeypatch):
+    settings = ["iterations=25", "batch_size=400"]
+    monkeypatch.setattr("experiments.plan.load_figure", lambda name: figure)
+    runs = make_plan("tiny", "smoke", settings, False, tmp_path / "a/runs").todo()
+    assert {train.execute(run) for run in runs} == {"finished"}
     (tmp_path / "b").mkdir()
-    assert start_sweep(tmp_path / "a", 25, EIGHT).wait(100) == 0
-    rng, kills, typed, process = random.Random(0), 0, 0, None
-    deadline = time.monotonic() + 100
-    while len(finished(tmp_path / "b")) < 8 or kills < 6:
+    rng, killed, typed, process = random.Random(0), 0, 0, None
+    deadline = time.monotonic() + 200
+    while len(finished(tmp_path / "b")) < len(runs) or killed < kills:
         assert time.monotonic() < deadline
         if process is None or process.poll() is not None:
-            process, typed = start_sweep(tmp_path / "b", 25, EIGHT), typed + 1
-        time.sleep(rng.uniform(0.2, 1.0))
+            process, typed = start_sweep(tmp_path / "b", 25, figure), typed + 1
+        time.sleep(rng.uniform(0.02, 0.2))
         workers = [child for child in psutil.Process(process.pid).children() if is_worker(child)]
         folders = [path.parent for path in (tmp_path / "b/runs").glob("*/status.json")]
         training = {status["pid"] for status in map(read_status, folders) if status["state"] == "running"}
-        if kills < 6 and (chosen := [w for w in workers if w.pid in training]):
+        if killed < kills and (chosen := [w for w in workers if w.pid in training]):
             rng.choice(chosen).kill()
-            kills += 1
-    assert process.wait(60) == 0 or start_sweep(tmp_path / "b", 25, EIGHT).wait(60) == 0
+            killed += 1
+    assert process.wait(60) == 0 or start_sweep(tmp_path / "b", 25, figure).wait(60) == 0
     assert typed >= 2
-    for folder in (tmp_path / "a/runs").glob("*/status.json"):
+    for run in runs:
         for name in ("progress.csv", "checkpoint.pt"):
-            other = tmp_path / "b/runs" / folder.parent.name / name
-            assert other.read_bytes() == (folder.parent / name).read_bytes()
-    assert len(finished(tmp_path / "a")) == 8
+            other = tmp_path / "b/runs" / run.run_id / name
+            assert other.read_bytes() == (run.folder / name).read_bytes()
 
 
 def test_a_terminated_sweep_leaves_every_run_resumable_and_no_orphan(tmp_path):
