@@ -12,7 +12,7 @@ from hippo import hippo
 from tests.toy import run
 
 CONTEXT = multiprocessing.get_context("forkserver")
-CONTEXT.set_forkserver_preload(["hippo.hippo"])  # processes are forked from one that has done nothing but import it
+CONTEXT.set_forkserver_preload(["hippo.hippo", "torch._dynamo"])  # imported once; processes are forked from that
 
 
 def train(folder, die_in_write, ready):
