@@ -152,9 +152,8 @@ class Commitment:
         self.skill = np.zeros(num_envs, np.int64)  # (N,)
         self.steps_left = np.zeros(num_envs, np.int64)  # (N,)
         self.time_left = torch.zeros(num_envs).numpy()  # (N,) steps left over the longest period, in (0, 1]
-        self._fraction = (np.arange(period_max + 1) / period_max).astype(
-            self.time_left.dtype
-        )  # steps left -> time left
+        fraction = np.arange(period_max + 1) / period_max
+        self._fraction = fraction.astype(self.time_left.dtype)  # steps left -> time left
 
     def renew(self, obs: np.ndarray, period: np.ndarray, uniform: np.ndarray | None) -> np.ndarray:
         """Where a commitment has run out take the new `period` (N,), then let the manager choose.
