@@ -38,7 +38,9 @@ def test_a_trajectory_is_as_it_was_or_the_revision_is_new(name):
     assert golden["mujoco"] == mujoco.__version__, "golden trajectories are for another MuJoCo"
     now = trajectory(name)
     for key, values in now.items():
-        np.testing.assert_allclose(values, golden[key], rtol=0, atol=1e-9, err_msg=key)
+        # Observations are in single precision: where another libm's 1e-16 crosses a boundary, their last bit turns.
+        last_bit = np.finfo(np.float32).eps if key == "observations" else 0
+        np.testing.assert_allclose(values, golden[key], rtol=last_bit, atol=1e-9, err_msg=key)
 
 
 if __name__ == "__main__":
