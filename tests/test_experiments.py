@@ -169,6 +169,7 @@ def test_a_run_leaves_what_it_is_where_it_came_from_and_what_it_measured(tmp_pat
         "timing.csv",
         "checkpoint.pt",
         "checkpoint.prev.pt",
+        "train.log",
     }
     status, manifest = (json.loads((run.folder / f"{name}.json").read_text()) for name in ("status", "manifest"))
     assert (status["state"], status["iteration"], status["env_steps"]) == ("finished", 2, 1200)
