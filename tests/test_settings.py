@@ -26,6 +26,8 @@ BUDGET = {"iterations": 1, "batch_size": 100, "horizon": 50}
         ("skill_baseline", "double"),
         ("manager_baseline", "skill"),
         ("skill_hidden_sizes", [64, 0]),
+        ("skill_hidden_sizes", []),
+        ("minibatch_size", 101),
         ("iterations", 0),
         ("batch_size", 49),
         ("period_min", 16),

@@ -161,6 +161,7 @@ def _in_minibatches(
     parts = max(1, num_steps // config.minibatch_size)
     parameters = [p for group in optimizer.param_groups for p in group["params"]]
     shares = [level.direct() for level in levels if level.direct is not None]
+    assert len(shares) == len(levels), "every level of a minibatch has its gradient written out"
     old = [in_chunks(level.log_prob, len(level.advantage)).numpy() for level in levels]
     advantage = [level.advantage.numpy() for level in levels]
     at = [None if level.at is None else level.at.numpy() for level in levels]

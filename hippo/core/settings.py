@@ -60,6 +60,8 @@ def check(config: Any) -> None:
     """Raise ConfigError for the first field of the dataclass `config` that lies outside its declared range."""
     for field in dataclasses.fields(config):
         value = getattr(config, field.name)
+        if isinstance(value, list) and not value:
+            raise ConfigError(field.name, "[]", "must not be empty")
         for element in value if isinstance(value, list | tuple) else [value]:
             _check_value(field.name, element, field.metadata)
 
