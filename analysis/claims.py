@@ -1,9 +1,7 @@
 """The paper's comparative sentences as predicates over the data: `python -m analysis.claims --scale laptop`.
 
-The sentences stand in claims.yaml, what each compares in predicates.py. A verdict is drawn from Welch's t interval of a
-difference over seeds (95 %, Holm over the places a sentence names): reproduced only if it holds in all of them (or in
-as many as the sentence says), not reproduced if the interval excludes it in any, else inconclusive; never from fewer
-than three seeds.
+The sentences stand in claims.yaml, what each compares in predicates.py, how a verdict is drawn in verdicts.py. All of
+them are listed, with the state of every place that they name; seeds below three decide nothing.
 """
 
 import sys
@@ -14,18 +12,19 @@ from typing import Any
 
 import numpy as np
 import yaml
-from scipy import stats as scipy_stats
 
+from analysis import verdicts
 from analysis.command_line import parser
 from analysis.edition import PAPER, chosen
 from analysis.predicates import KINDS, Kind, Pairs, Printed, Spec
 from analysis.runs import MissingData, Results, load
+from analysis.verdicts import FEWEST_SEEDS, INCONCLUSIVE, NOT_REPRODUCED, REPRODUCED, UNDECIDABLE, Ruling
 
 ROOT = Path(__file__).parent.parent
-ALPHA = 0.05
-FEWEST_SEEDS = 3
-REPRODUCED, NOT_REPRODUCED, INCONCLUSIVE = "reproduced", "not reproduced", "inconclusive at this budget"
-NO_DATA, NO_RUNS, SMOKE = "no data", "no run can decide it", "smoke: no verdicts"
+NO_DATA, SMOKE = "no data", "smoke: no verdicts"
+NO_RUN = "by the sizes printed, no run needed"
+MOST_PLACES = 4  # that are named in a table's cell
+COUNT_SEEDS, RESAMPLES = 5, 4000  # fewest seeds of a count's bootstrap, and its resamples
 
 
 @dataclass(frozen=True)
@@ -57,79 +56,91 @@ class Claim:
 CLAIMS = tuple(Claim(**entry) for entry in yaml.safe_load(Path(__file__).with_name("claims.yaml").read_text()))
 
 
-@dataclass(frozen=True)
-class Difference:
-    """Favoured minus other in one place, and its interval at the level that Holm's procedure tests it at."""
-
-    mean: float
-    low: float
-    high: float
-    p: float  # two-sided, unadjusted
-    seeds: tuple[int, int]
-
-
-def welch(x: np.ndarray, y: np.ndarray, level: float = 1 - ALPHA) -> Difference:
-    """Welch's t interval of mean(x) - mean(y); without any spread the interval is the point."""
-    mean, counts = float(np.mean(x) - np.mean(y)), (len(x), len(y))
-    if np.ptp(x) == np.ptp(y) == 0:
-        return Difference(mean, mean, mean, 1.0 if mean == 0 else 0.0, counts)
-    result = scipy_stats.ttest_ind(x, y, equal_var=False)
-    low, high = result.confidence_interval(level)
-    return Difference(mean, float(low), float(high), float(result.pvalue), counts)
-
-
-def holm(pairs: Pairs) -> dict[str, Difference]:
-    """Welch's intervals, stepped down: smallest p at 1 - alpha/m, next at 1 - alpha/(m - 1), until one fails."""
-    ordered = sorted(pairs, key=lambda place: welch(*pairs[place]).p)
-    result, divisor = {}, len(pairs)
-    for place in ordered:
-        result[place] = welch(*pairs[place], level=1 - ALPHA / divisor)
-        if result[place].p < ALPHA / divisor:
-            divisor -= 1  # a failure keeps the level for all that follow, none of which can then exclude nothing
-    return {place: result[place] for place in pairs}
-
-
-def verdict(claim: Claim, differences: dict[str, Difference]) -> str:
-    """What the differences say about the sentence; places without enough seeds are simply not in `differences`."""
-    needed = len(claim.places) if claim.needed is None else claim.needed
-    if sum(d.high < 0 for d in differences.values()) > len(claim.places) - needed:
-        return NOT_REPRODUCED
-    return REPRODUCED if sum(d.low > 0 for d in differences.values()) >= needed else INCONCLUSIVE
-
-
-def judge(claim: Claim, results: Results) -> tuple[str, dict[str, Difference]]:
-    """Verdict and differences; places with fewer than three seeds on a side are left out and decide nothing."""
+def judge(claim: Claim, results: Results) -> Ruling:
+    """The verdict on a claim; places with fewer than three seeds on a side are left out and show nothing."""
     pairs = claim.kind.pairs(claim.compare, results)
-    differences = holm({place: both for place, both in pairs.items() if min(map(len, both)) >= FEWEST_SEEDS})
-    return verdict(claim, differences), differences
+    enough = {place: both for place, both in pairs.items() if min(map(len, both)) >= FEWEST_SEEDS}
+    notable = verdicts.NOTABLE if claim.kind.notable(claim.compare) else 0.0
+    comparisons = {place: verdicts.compare(*both, notable) for place, both in enough.items()}
+    if "share_of_cells" in claim.compare:
+        return count_of_cells(claim, enough, comparisons)
+    return verdicts.rule(comparisons, claim.places, claim.needed or len(claim.places))
 
 
-def coverage(seeds: int, skewed: bool, trials: int = 4000) -> float:
-    """Share of Welch's 95 % intervals that hold the true difference: spreads 1 and 3, normal or log-normal scores."""
+def count_of_cells(claim: Claim, pairs: Pairs, comparisons: dict[str, verdicts.Comparison]) -> Ruling:
+    """The verdict on "in so many of the cells": their number by point differences, seeds of each side resampled."""
+    needed = int(np.ceil(claim.compare["share_of_cells"] * len(claim.places) - 1e-9))
+    words = f"{needed} of {len(claim.places)} cells needed"
+    if len(pairs) < len(claim.places) or min(min(map(len, both)) for both in pairs.values()) < COUNT_SEEDS:
+        return Ruling(UNDECIDABLE, f"fewer than {COUNT_SEEDS} seeds; {words}", comparisons)
     rng = np.random.default_rng(0)
-    x, y = rng.normal(size=(2, trials, seeds))
-    if skewed:
-        x, y = np.exp(x) - np.exp(0.5), np.exp(y) - np.exp(0.5)
-    result = scipy_stats.ttest_ind(x, 3 * y, axis=1, equal_var=False)
-    low, high = result.confidence_interval(1 - ALPHA)
-    return float(((low <= 0) & (high >= 0)).mean())
+    above = np.zeros(RESAMPLES, int)
+    for x, y in pairs.values():
+        drawn = [rng.choice(side, (RESAMPLES, len(side))).mean(1) for side in (x, y)]
+        above += drawn[0] > drawn[1]
+    low, high = np.quantile(above, [verdicts.ALPHA, 1 - verdicts.ALPHA], method="inverted_cdf")
+    observed = sum(c.mean > 0 for c in comparisons.values())
+    why = f"{observed} cells [{low}, {high}]; {words}"
+    if low >= needed:
+        return Ruling(REPRODUCED, why, comparisons)
+    return Ruling(NOT_REPRODUCED if high < needed else INCONCLUSIVE, why, comparisons)
 
 
-def ruled(claim: Claim, results: Results | None) -> tuple[str, str]:
-    """Verdict and differences of one claim in words."""
+def ruled(claim: Claim, results: Results | None, paper: dict[str, Any]) -> Ruling:
+    """The verdict on a claim by whatever there is of its figure; without one it is a matter of arithmetic."""
     if claim.figure is None:
-        return NO_RUNS, ""
+        printed = claim.printed(paper)
+        assert printed is not None, f"{claim.name}: nothing can decide it"
+        holds = printed.holds >= (claim.needed or printed.places)
+        return Ruling(REPRODUCED if holds else NOT_REPRODUCED, NO_RUN, {})
     if results is None:
-        return NO_DATA, ""
-    ruling, differences = judge(claim, results)
-    shown = [
-        f"{place} {d.mean:+.3g} [{d.low:.3g}, {d.high:.3g}] n = {d.seeds[0]}, {d.seeds[1]}"
-        for place, d in differences.items()
-    ]
-    left_out = [place for place in claim.places if place not in differences]
-    if left_out:
-        shown.append(f"fewer than {FEWEST_SEEDS} seeds: {', '.join(left_out)}")
-    return ruling, "; ".join(shown)
+        return Ruling(NO_DATA, "", {})
+    ruling = judge(claim, results)
+    return ruling if ruling.comparisons else Ruling(NO_DATA, ruling.why, {})
+
+
+def in_words(ruling: Ruling) -> str:
+    """Every place with its difference, its 90 % interval and its own verdict."""
+    return "; ".join(
+        f"{place} {c.mean:+.3g} [{c.low:.3g}, {c.high:.3g}] n = {c.seeds[0]}, {c.seeds[1]}: {c.verdict}"
+        for place, c in ruling.comparisons.items()
+    )
+
+
+def verdict_of(ruling: Ruling) -> str:
+    """The verdict with its reason; where some places were not trained, with those of the others."""
+    if ruling.verdict != UNDECIDABLE or len(ruling.comparisons) > MOST_PLACES:
+        return ruling.verdict + (f" ({ruling.why})" if ruling.why else "")
+    by_place = ", ".join(f"{place} {c.verdict}" for place, c in ruling.comparisons.items())
+    return f"{ruling.verdict} ({ruling.why}); {by_place}"
+
+
+def tally(rulings: Sequence[Ruling]) -> str:
+    """How many claims are decided, in one line."""
+    good, bad = (sum(r.verdict == verdict for r in rulings) for verdict in (REPRODUCED, NOT_REPRODUCED))
+    partly = {v: sum(r.where_trained == v for r in rulings) for v in (REPRODUCED, NOT_REPRODUCED)}
+    line = f"{len(rulings)} claims: {good} reproduced, {bad} not reproduced, {len(rulings) - good - bad} undecided"
+    return line + (
+        f" (of these, where they were trained: {partly[REPRODUCED]} reproduced, {partly[NOT_REPRODUCED]} not)"
+        if any(partly.values())
+        else ""
+    )
+
+
+def paper_values() -> dict[str, Any]:
+    """Numbers printed in the paper."""
+    return yaml.safe_load((ROOT / "paper_figures" / "paper_values.yaml").read_text())
+
+
+def load_figures(scale: str, runs_dir: Path, data_dir: Path, protocol: str) -> dict[str, Results]:
+    """The results of every figure that a claim is about, as far as there are any."""
+    results = {}
+    for figure in dict.fromkeys(claim.figure for claim in CLAIMS if claim.figure is not None):
+        try:
+            results[figure] = load(figure, scale, runs_dir, data_dir, None, protocol)
+        except MissingData:
+            continue
+    return results
 
 
 def own_numbers(claim: Claim, paper: dict[str, Any]) -> str:
@@ -144,26 +155,20 @@ def own_numbers(claim: Claim, paper: dict[str, Any]) -> str:
 
 def lines(scale: str, runs_dir: Path, data_dir: Path, protocol: str = PAPER) -> list[str]:
     """The table as Markdown lines."""
-    paper = yaml.safe_load((ROOT / "paper_figures" / "paper_values.yaml").read_text())
-    out = [SMOKE, ""] if scale == "smoke" else []
-    out += [
-        "| claim | where | sentence | verdict | differences [interval] | the paper's own numbers |",
+    paper = paper_values()
+    results = {} if scale == "smoke" else load_figures(scale, runs_dir, data_dir, protocol)
+    smoke = scale == "smoke"
+    rulings = [Ruling(SMOKE, "", {}) if smoke else ruled(c, results.get(c.figure or ""), paper) for c in CLAIMS]
+    out = [
+        SMOKE if smoke else tally(rulings),
+        "",
+        "| claim | where | sentence | verdict | differences [90 % interval] | the paper's own numbers |",
         "|---|---|---|---|---|---|",
     ]
-    results: dict[str, Results | None] = {}
-    for figure in {claim.figure for claim in CLAIMS if claim.figure is not None and scale != "smoke"}:
-        try:
-            results[figure] = load(figure, scale, runs_dir, data_dir, None, protocol)
-        except MissingData:
-            results[figure] = None
-    for claim in CLAIMS:
-        ruling, shown = (SMOKE, "") if scale == "smoke" else ruled(claim, results.get(claim.figure or ""))
-        row = (claim.name, claim.source, claim.sentence, ruling, shown, own_numbers(claim, paper))
-        out.append(f"| {' | '.join(row)} |")
-    measured_coverage = "; ".join(
-        f"n = {n}: {coverage(n, False):.3f} normal, {coverage(n, True):.3f} log-normal" for n in (3, 5, 10)
-    )
-    return [*out, "", f"Measured coverage of Welch's 95 % interval, spreads 1 and 3: {measured_coverage}."]
+    for claim, ruling in zip(CLAIMS, rulings, strict=True):
+        words = (verdict_of(ruling), in_words(ruling), own_numbers(claim, paper))
+        out.append(f"| {' | '.join((claim.name, claim.source, claim.sentence, *words))} |")
+    return [*out, "", "The rule and its error rates: docs/verdicts.md."]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -12,24 +12,26 @@ from pathlib import Path
 import numpy as np
 
 from analysis import stats
-from analysis.claims import CLAIMS, NO_DATA, judge
+from analysis.claims import CLAIMS, in_words, paper_values, ruled, tally, verdict_of
 from analysis.command_line import PROTOCOLS
-from analysis.edition import Edition
+from analysis.edition import PAPER, Edition
 from analysis.runs import MissingData, Results, load, scores
+from analysis.verdicts import Ruling
 
 ROOT = Path(__file__).parent.parent
 DATA = ROOT / "paper_figures" / "data"
-SCALES = ("laptop", "paper")
+SCALES = ("laptop", "paper")  # the larger one last
 HEAD = """# Results
 
 Written by `make results` from the committed rows under `paper_figures/data/`; do not edit. What is not here has not
 been trained. `python -m analysis.explain paper_figures/data/laptop/fig3.csv` lists the runs behind a file, and
 [reproduce.md](reproduce.md) says how to train any of them again.
 """
-FINAL = """Return over the last 10 % of iterations, mean ± standard deviation over seeds, and area under the curve (mean
-return over all iterations). With three seeds these decide little: the verdicts below use intervals. The curves in the
-pictures are smoothed ([reproduce.md](reproduce.md)), the numbers are not.
+NUMBERS = """Final: return over the last 10 % of iterations, mean ± standard deviation over seeds. Gain: that less the
+first 10 %, for methods do not start alike. Area: mean return over all iterations. The pictures' curves are smoothed
+([reproduce.md](reproduce.md)), the numbers are not.
 """
+CALLED = {PAPER: "as printed"}  # protocols, in the table of verdicts
 
 
 def performance(results: Results, env: str) -> list[str]:
@@ -42,26 +44,33 @@ def performance(results: Results, env: str) -> list[str]:
             continue
         curves = [table[seed].dropna().to_numpy() for seed in seeds]
         final = np.array([stats.final_performance(curve) for curve in curves])
+        gain = final - [stats.final_performance(curve[::-1]) for curve in curves]
         area = np.array([curve.mean() for curve in curves])
-        spread = [f" ± {stats.standard_deviation(x):.2f}" if len(seeds) > 1 else "" for x in (final, area)]
-        text = f"{final.mean():.2f}{spread[0]} | {area.mean():.2f}{spread[1]}"
-        rows.append((-final.mean(), f"| {label[variant]} | {len(seeds)} | {steps[-1] / 1e6:.1f} M | {text} |"))
+        cells = [f"{x.mean():.2f}" + (f" ± {x.std(ddof=1):.2f}" if len(seeds) > 1 else "") for x in (final, gain, area)]
+        row = f"| {label[variant]} | {len(seeds)} | {steps[-1] / 1e6:.1f} M | {' | '.join(cells)} |"
+        rows.append((-final.mean(), row))
     return [row for _, row in sorted(rows)]
 
 
-def section(results: Results, pictures: Path) -> list[str]:
-    """One figure: its picture and its numbers."""
+def picture(results: Results, pictures: Path) -> list[str]:
+    """The picture of one figure, if it is there."""
     plan = results.plan
     name = "_".join([*results.edition.folder.parts, f"{plan['figure']}.png"])
-    lines = [f"## {plan['title']} ({plan['figure']}, {plan['scale']} scale)", ""]
-    if (pictures / name).exists():
-        lines += [f"![{plan['title']}](pictures/{name})", ""]
+    if not (pictures / name).exists():
+        return []
+    return [f"**{plan['title']}** ({plan['figure']}, {plan['scale']} scale)", "", f"![](pictures/{name})", ""]
+
+
+def section(results: Results) -> list[str]:
+    """One figure in numbers."""
+    plan = results.plan
+    lines = [f"### {plan['title']} ({plan['figure']}, {plan['scale']} scale)", ""]
     labels = {run["env"]: (run["env_label"], run["physics"]) for run in plan["runs"]}
     for env, (label, physics) in labels.items():
         rows = performance(results, env)
         if rows:
-            head = f"| {label}, {physics} physics | seeds | steps | final | area |"
-            lines += [head, "|---|---|---|---|---|", *rows, ""]
+            head = f"| {label}, {physics} physics | seeds | steps | final | gain | area |"
+            lines += [head, "|---|---|---|---|---|---|", *rows, ""]
     if results.missing:
         lines += ["Planned and not trained: " + "; ".join(untrained(results)) + ".", ""]
     return lines
@@ -84,7 +93,7 @@ def untrained(results: Results) -> list[str]:
 def table_section(results: Results) -> list[str]:
     """One table of the paper: the mean over seeds of every quantity, as measured."""
     plan = results.plan
-    lines = [f"## {plan['title']} ({plan['figure']}, {plan['scale']} scale)", ""]
+    lines = [f"### {plan['title']} ({plan['figure']}, {plan['scale']} scale)", ""]
     labels = {(run["env"], run["variant"]): f"{run['env_label']}, {run['variant_label']}" for run in plan["runs"]}
     shown = {
         key: label for key, label in labels.items() if key in set(results.frame.groupby(["env", "variant"]).groups)
@@ -100,45 +109,78 @@ def table_section(results: Results) -> list[str]:
     return lines
 
 
-def verdicts(edition: Edition, results: dict[str, Results]) -> list[str]:
-    """The claims that the committed figures of one edition can say something about."""
-    lines = [
-        f"## Verdicts, {edition.called}",
-        "",
-        "| sentence | where | verdict | difference [interval] |",
-        "|---|---|---|---|",
-    ]
+Everything = dict[Edition, dict[str, Results]]  # by edition, then by figure
+Rulings = dict[str, list[tuple[Ruling, Edition | None]]]  # by protocol, in the order of CLAIMS
+
+
+def rulings_of(everything: Everything, protocol: str) -> list[tuple[Ruling, Edition | None]]:
+    """Every claim's verdict under a protocol and the edition it is from: the largest scale with data on its figure."""
+    paper, result = paper_values(), []
     for claim in CLAIMS:
-        if claim.figure not in results:
-            continue
-        ruling, differences = judge(claim, results[claim.figure])
-        shown = "; ".join(f"{place} {d.mean:+.2f} [{d.low:.2f}, {d.high:.2f}]" for place, d in differences.items())
-        lines.append(f"| {claim.sentence} | {claim.source} | {ruling if shown else NO_DATA} | {shown} |")
+        there = [e for e, results in everything.items() if e.protocol == protocol and claim.figure in results]
+        edition = there[-1] if there else None
+        results = everything[edition][claim.figure] if edition and claim.figure else None
+        result.append((ruled(claim, results, paper), edition))
+    return result
+
+
+def verdicts(rulings: Rulings) -> list[str]:
+    """All claims at a glance: a line per protocol and a table with a row per claim."""
+    protocols = list(rulings)
+    names = [CALLED.get(protocol, protocol) for protocol in protocols]
+    lines = ["## Verdicts", ""]
+    for protocol, name in zip(protocols, names, strict=True):
+        lines.append(f"* **{name}**: {tally([ruling for ruling, _ in rulings[protocol]])}.")
+    lines += ["", "How a verdict is drawn, and how often it errs: [verdicts.md](verdicts.md).", ""]
+    lines += [f"| sentence | where | {' | '.join(names)} |", "|---|---|" + "---|" * len(names)]
+    for i, claim in enumerate(CLAIMS):
+        cells = [verdict_of(rulings[protocol][i][0]) for protocol in protocols]
+        lines.append(f"| {claim.sentence} | {claim.source} | {' | '.join(cells)} |")
+    return [*lines, ""]
+
+
+def differences(rulings: Rulings) -> list[str]:
+    """What the verdicts are drawn from."""
+    lines = [
+        "## Differences",
+        "",
+        "Favoured side minus the other, with its 90 % interval (two one-sided 95 % bounds).",
+        "",
+    ]
+    lines += ["| sentence | from | differences |", "|---|---|---|"]
+    for of_protocol in rulings.values():
+        for claim, (ruling, edition) in zip(CLAIMS, of_protocol, strict=True):
+            if ruling.comparisons and edition:
+                lines.append(f"| {claim.sentence} | {claim.figure}, {edition.called} | {in_words(ruling)} |")
     return [*lines, ""]
 
 
 def page(runs_dir: Path, data: Path, pictures: Path) -> str:
     """The whole page, from plans in `runs_dir` (for names only) and rows in `data`."""
-    lines = [HEAD]
+    everything: Everything = {}
     for edition in (Edition(scale, protocol) for protocol in PROTOCOLS for scale in SCALES):
-        results = {}
         for path in sorted((data / edition.folder).glob("*.csv")):
+            if "." in path.stem:  # where the runs come from
+                continue
             try:
-                results[path.stem] = load(path.stem, edition.scale, runs_dir, data, None, edition.protocol)
+                results = load(path.stem, edition.scale, runs_dir, data, None, edition.protocol)
             except MissingData as error:
                 raise ValueError(f"{path}: {error}") from error
-        curves = {name: each for name, each in results.items() if name.startswith("fig")}
-        if curves:
-            lines.append(FINAL)
-        for each in curves.values():
-            lines += section(each, pictures)
-        for name, each in results.items():
-            if name not in curves:
-                lines += table_section(each)
-        if results:
-            lines += verdicts(edition, results)
-    if len(lines) == 1:
-        lines.append("No results are committed yet.")
+            everything.setdefault(edition, {})[path.stem] = results
+    if not everything:
+        return f"{HEAD}\nNo results are committed yet.\n"
+    rulings = {e.protocol: rulings_of(everything, e.protocol) for e in everything}
+    lines = [HEAD, *verdicts(rulings), "## Pictures", ""]
+    for of_edition in everything.values():
+        for results in of_edition.values():
+            lines += picture(results, pictures)
+    for edition, of_edition in everything.items():
+        lines += [f"## Numbers, {edition.called}", ""]
+        curves = {name for name in of_edition if name.startswith("fig")}
+        lines += [NUMBERS] if curves else []
+        for name, results in of_edition.items():
+            lines += section(results) if name in curves else table_section(results)
+    lines += differences(rulings)
     return "\n".join(lines).rstrip() + "\n"
 
 

@@ -127,7 +127,8 @@ def load(
             rows = read_episodes(runs_dir / run["run_id"] / "episodes.csv")
         else:
             rows = read_progress(runs_dir / run["run_id"] / "progress.csv", metrics)
-        expected = run["iterations"] if run["kind"] == "train" else 1
+        # Only whole runs are ever committed, and perhaps thinned.
+        expected = run["iterations"] if run["kind"] == "train" and run["state"] != "committed" else 1
         if rows.empty or rows.groupby("metric").size().min() < expected:
             missing.append(run)
         if not rows.empty:  # an empty part would turn numbers into objects

@@ -14,12 +14,12 @@ import pandas as pd
 import yaml
 
 from analysis import stats
+from analysis.predicates import CANNOT_CHANGE
 from analysis.runs import Results
 from paper_figures import command_line, tabular
 
 HERE = Path(__file__).parent
 ORIGINAL = "return:none:original"
-CANNOT_CHANGE = {("snake_gather", "damping"), ("snake_gather", "friction")}  # docs/environments/perturbations.md
 NOTE = (
     "Mean over seeds of the mean return of each seed's episodes ± the standard deviation over seeds, its 95 % "
     "percentile bootstrap interval over seeds, and the change in percent of the original return's absolute value. "

@@ -6,7 +6,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from analysis import results
+from analysis import claims, results
 from analysis.command_line import PROTOCOLS
 from analysis.edition import Edition
 from analysis.runs import COLUMNS
@@ -15,6 +15,11 @@ from tests.test_analysis import planned
 
 ROOT = Path(__file__).parent.parent
 EDITIONS = [Edition(scale, protocol) for protocol in PROTOCOLS for scale in results.SCALES]
+
+
+def tables(edition):
+    """Committed rows, without what says where their runs come from."""
+    return sorted(path for path in (results.DATA / edition.folder).glob("*.csv") if "." not in path.stem)
 
 
 def committed(tmp_path, scale="laptop"):
@@ -35,11 +40,12 @@ def committed(tmp_path, scale="laptop"):
 def test_final_and_area_by_hand(tmp_path):
     committed(tmp_path)
     page = results.page(tmp_path, tmp_path / "data", tmp_path)
-    # Last 10 %: 9 and 19, whose deviation is sqrt(50); areas: 4.5 and 14.5.
-    assert "| PPO | 2 | 0.0 M | 14.00 ± 7.07 | 9.50 ± 7.07 |" in page
-    assert "## A title (fig3, laptop scale)" in page
-    assert "| no data |" in page
-    assert "reproduced |" not in page
+    # Last 10 %: 9 and 19, whose deviation is sqrt(50); first: 0 and 10; areas: 4.5 and 14.5.
+    assert "| PPO | 2 | 0.0 M | 14.00 ± 7.07 | 9.00 ± 0.00 | 9.50 ± 7.07 |" in page
+    assert "### A title (fig3, laptop scale)" in page
+    rows = [line for line in page.splitlines() if line.endswith(("no data |", "needed) |"))]
+    assert len(rows) == len(claims.CLAIMS)  # one is decided by arithmetic
+    assert "**as printed**: 39 claims: 0 reproduced, 1 not reproduced, 38 undecided." in page
 
 
 def test_without_committed_rows_it_says_so(tmp_path):
@@ -57,7 +63,7 @@ def test_rows_without_a_plan_are_one_clear_error(tmp_path, capsys):
 
 def test_the_committed_page_is_fresh(tmp_path):
     for edition in EDITIONS:
-        for path in sorted((results.DATA / edition.folder).glob("*.csv")):
+        for path in tables(edition):
             make_plan(path.stem, edition.scale, [], False, tmp_path, edition.protocol).write(tmp_path)
     written = (ROOT / "docs" / "results.md").read_text()
     assert results.page(tmp_path, results.DATA, ROOT / "docs" / "pictures") == written, "run `make results`"
@@ -65,7 +71,7 @@ def test_the_committed_page_is_fresh(tmp_path):
 
 @pytest.mark.parametrize("edition", EDITIONS, ids=str)
 def test_every_committed_row_belongs_to_a_planned_run(edition, tmp_path):
-    for path in sorted((results.DATA / edition.folder).glob("*.csv")):
+    for path in tables(edition):
         plan = make_plan(path.stem, edition.scale, [], False, tmp_path, edition.protocol)
         ids = set(pd.read_csv(path, dtype={"run_id": str})["run_id"])
         assert ids <= {entry.run.run_id for entry in plan.entries}
