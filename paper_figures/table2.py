@@ -29,6 +29,7 @@ PROBABILITIES = {
     "posterior": "posterior over skills, uniform manager",
     "density": "joint density",
 }
+OTHERS = 5  # skills beside the one that acts
 
 
 def cell(values: pd.Series, name: str) -> str:
@@ -61,6 +62,13 @@ def rows(results: Results) -> list[dict[str, str]]:
             for name, what in PROBABILITIES.items():
                 ours = cell(values, f"{prefix}_{name}")
                 table.append(common | {"quantity": quantity, "definition": what, "ours": ours, "paper": reported})
+        # All six posteriors add up to one, so the mean of the others follows from the skill's own.
+        average = f"{(1 - values['own_posterior_mean']) / OTHERS:.3f}"
+        table.append(
+            common
+            | {"quantity": "mean other", "definition": PROBABILITIES["posterior"], "ours": average}
+            | {"paper": "{} ± {}".format(*printed["other"])}
+        )
         # What Lemma 1 neglects, at the paper's p = 10; its text puts 10^-10 for 0.1^9.
         for name, what in PROBABILITIES.items():
             other, own = values[f"other_{name}_mean"], values[f"own_{name}_mean"]

@@ -322,11 +322,12 @@ def test_table_2_shows_every_definition_beside_the_papers_numbers():
     )
     results = Results({"runs": [run], "title": "t"}, frame, [])
     table = table2.rows(results)
-    assert len(table) == 4 + 4 * 5
+    assert len(table) == 4 + 4 * 5 + 1
     by = {(row["quantity"], row["definition"]): row for row in table}
     assert by["cosine", "whole batch, both weighted by A_k"]["ours"] == "0.970"
     own = by["own", "joint density"]
     assert (own["ours"], own["paper"]) == ("0.400 ± 0.050", "0.31 ± 0.09")
+    assert by["mean other", "posterior over skills, uniform manager"]["ours"] == "0.120"  # five share 0.6
     assert by["max other^9", "joint density"]["ours"] == "1.0e-09"
     assert by["(max other / own)^10", "joint density"]["ours"] == "9.5e-07"  # 0.25 ** 10
     text = tabular.latex(table, "runs: ab")
