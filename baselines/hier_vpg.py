@@ -80,7 +80,7 @@ def train(config: HierVPGConfig, make_envs: MakeEnvs, log: RunLog, seed: int, ch
         steps.check(iteration)
         collected = time.perf_counter()
         statistics = policy_statistics(policy, batch)  # of the policy that collected, before its update
-        baselines.scale_rewards(steps, config.gamma)
+        steps.scale_rewards(baselines.reward_scale, config.gamma)
         estimate = advantages(batch, baselines, config)
         objective = policy_gradient_step(
             levels(policy, batch, estimate.manager, estimate.skills), optimizer, steps.num_steps

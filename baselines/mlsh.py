@@ -264,7 +264,7 @@ def train(config: MLSHConfig, make_envs: MakeEnvs, log: RunLog, seed: int, check
         steps.check(iteration)
         collected = time.perf_counter()
         statistics = policy_statistics(policy, batch)  # of the policy that collected, before its update
-        baselines.scale_rewards(steps, config.gamma)
+        steps.scale_rewards(baselines.reward_scale, config.gamma)
         estimate = estimate_and_fit(batch, baselines, config)
         trained = ["manager", "skill"] if joint else ["manager"]
         objective = levels(policy, batch, estimate.manager, estimate.skills, trained)

@@ -145,9 +145,7 @@ def train(config: PPOConfig, make_envs: MakeEnvs, log: RunLog, seed: int, checkp
                 "action_std": float(policy.log_std.exp().mean()),
             }
 
-        if reward_scale is not None:
-            reward_scale.take_in(steps.reward, steps.done, config.gamma)
-            steps.scaled_reward = reward_scale(steps.reward)
+        steps.scale_rewards(reward_scale, config.gamma)
         value = baseline.predict(steps.obs)
         final_obs, step, env = steps.final()
         next_value = value[1:].index_put((step, env), baseline.predict(final_obs))

@@ -316,7 +316,7 @@ def measure(
     policy = restored_policy(config, envs, checkpoint)
     baselines, iteration = restored_baselines(config, envs, checkpoint)
     batch = collect(policy, envs, config, seed, iteration)
-    baselines.scale_rewards(batch.steps, config.gamma, frozen=True)
+    batch.steps.scale_rewards(baselines.reward_scale, config.gamma, frozen=True)
     estimate = advantages(batch, baselines, config)
     another = collect(policy, envs, config, seed, iteration + 1)
     envs.close()

@@ -86,7 +86,7 @@ def train(config: HippoConfig, make_envs: MakeEnvs, log: RunLog, seed: int, chec
         steps.check(iteration)
         collected = time.perf_counter()
         statistics = policy_statistics(policy, batch)  # of the policy that collected, before its update
-        baselines.scale_rewards(steps, config.gamma)
+        steps.scale_rewards(baselines.reward_scale, config.gamma)
         estimate = advantages(batch, baselines, config)
         objective = levels(policy, batch, estimate.manager, estimate.skills, config.trained_levels)
         critics = baselines.critics(batch, estimate.returns) if config.values_in_loop else []

@@ -127,7 +127,7 @@ def test_a_measurement_scales_rewards_as_training_did_and_leaves_the_scale_alone
     policy = restored_policy(config, TargetEnv(1, 0), Checkpoint(tmp_path))
     steps = collect(policy, TargetEnv(20, 0), config, 0, iteration).steps
     variance = float(load(tmp_path / "checkpoint.pt")["baselines"]["reward_scale.variance"])
-    baselines.scale_rewards(steps, config.gamma, frozen=True)
+    steps.scale_rewards(baselines.reward_scale, config.gamma, frozen=True)
     torch.testing.assert_close(steps.scaled_reward, (steps.reward / variance**0.5).clamp(-10, 10))
     assert float(baselines.reward_scale.variance) == variance
     measured = gradients.measure(config, lambda n, _: TargetEnv(n, 0), 0, Checkpoint(tmp_path))
@@ -177,7 +177,7 @@ def test_minibatch_steps_equal_torchs_own_autograd_and_adam_in_float64():
         policy = HierarchicalPolicy(config, 2, 2, 2, generator)
         baselines = Baselines(config, 2, generator, in_loop=True)
         batch = collect(policy, TargetEnv(20, 0, death_rate=0.02), config, 0, 0)
-        baselines.scale_rewards(batch.steps, config.gamma)
+        batch.steps.scale_rewards(baselines.reward_scale, config.gamma)
         estimate = advantages(batch, baselines, config)
         policy.double(), baselines.double()
         batch.steps.obs, batch.steps.action, batch.time_left = (
@@ -256,7 +256,7 @@ def test_values_trained_in_the_loop_are_never_fitted_and_predict_what_the_optimi
     optimizer = make_optimizer(config, [*policy.parameters(), *baselines.parameters()])
     before = copy.deepcopy(baselines.state_dict())
     batch = collect(policy, TargetEnv(20, 0), config, 0, 0)
-    baselines.scale_rewards(batch.steps, config.gamma)
+    batch.steps.scale_rewards(baselines.reward_scale, config.gamma)
     estimate = advantages(batch, baselines, config)
     objective = levels(policy, batch, estimate.manager, estimate.skills)
 

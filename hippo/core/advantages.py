@@ -9,7 +9,6 @@ from hippo.core.direct import SquaredError, network_of
 from hippo.core.gae import gae, segment_gae
 from hippo.core.hierarchy import Batch, HierarchyConfig, rows_by_skill, with_time
 from hippo.core.normalize import RewardScale, standardize
-from hippo.core.rollout import Steps
 from hippo.core.value import ValueFunction, explained_variance
 
 
@@ -39,13 +38,6 @@ class Baselines(nn.Module):
         if kind == "none":
             return torch.zeros(time_left.shape, dtype=torch.float64)
         return getattr(self, kind).predict(*self.inputs(kind, obs, time_left, skill))
-
-    def scale_rewards(self, steps: Steps, gamma: float, frozen: bool = False) -> None:
-        """Let the levels learn from scaled rewards, if that is the setting; `frozen`: by the scale as it is."""
-        if self.reward_scale is not None:
-            if not frozen:
-                self.reward_scale.take_in(steps.reward, steps.done, gamma)
-            steps.scaled_reward = self.reward_scale(steps.reward)
 
     def critics(self, batch: Batch, returns: dict[str, Tensor]) -> list[SquaredError]:
         """The baselines in use over the rows that `levels` has, sorted by skill."""

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from hippo.core.episodes import episode_statistics
 from hippo.core.log import check_finite
-from hippo.core.normalize import ObservationFilter
+from hippo.core.normalize import ObservationFilter, RewardScale
 
 
 class LastInfo(gym.vector.VectorWrapper):
@@ -120,6 +120,13 @@ class Steps:
         """Let the filter know the observations of a batch that has been learnt from."""
         if observation_filter is not None:
             observation_filter.update(self.raw_obs[:-1])
+
+    def scale_rewards(self, reward_scale: RewardScale | None, gamma: float, frozen: bool = False) -> None:
+        """Learn from scaled rewards, if there is a scale, which knows the batch's first; `frozen`: from it as it is."""
+        if reward_scale is not None:
+            if not frozen:
+                reward_scale.take_in(self.reward, self.done, gamma)
+            self.scaled_reward = reward_scale(self.reward)
 
     @property
     def num_steps(self) -> int:
