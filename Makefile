@@ -77,10 +77,13 @@ results: install  ## docs/results.md and its pictures, from the committed result
 		edition="--scale $$scale --protocol $$protocol --runs-dir build/results"; \
 		$(PY) experiments.sweep write all $$edition || exit; \
 		[ $$protocol = paper ] && folder=$$scale || folder=$$protocol/$$scale; \
-		for csv in $$(ls paper_figures/data/$$folder/fig*.csv 2> /dev/null); do \
+		for csv in $$(ls paper_figures/data/$$folder/fig?.csv 2> /dev/null); do \
 			figure=$$(basename $$csv .csv); \
 			$(PY) paper_figures.$$figure $$edition --out build/results/out > /dev/null && \
-			cp build/results/out/$$folder/$$figure.png docs/pictures/$${folder/\//_}_$$figure.png || exit; \
+			{ [ $$protocol = paper ] || $(PY) paper_figures.aggregate $$figure $$edition --out build/results/out > /dev/null; } && \
+			for png in build/results/out/$$folder/$$figure{,.aggregate}.png; do \
+				[ ! -e $$png ] || cp $$png docs/pictures/$${folder/\//_}_$$(basename $$png) || exit; \
+			done || exit; \
 		done; \
 	done; done
 	@$(PY) analysis.results --runs-dir build/results

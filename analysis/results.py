@@ -53,18 +53,20 @@ def performance(results: Results, env: str) -> list[str]:
 
 
 def picture(results: Results, pictures: Path) -> list[str]:
-    """The picture of one figure, if it is there."""
+    """The pictures of one figure that are there: its curves, and all tasks at once."""
     plan = results.plan
-    name = "_".join([*results.edition.folder.parts, f"{plan['figure']}.png"])
-    if not (pictures / name).exists():
+    stem = "_".join([*results.edition.folder.parts, plan["figure"]])
+    there = [name for name in (f"{stem}.png", f"{stem}.aggregate.png") if (pictures / name).exists()]
+    if not there:
         return []
-    return [f"**{plan['title']}** ({plan['figure']}, {plan['scale']} scale)", "", f"![](pictures/{name})", ""]
+    lines = [f"**{plan['title']}** ({plan['figure']}, {results.edition.called})", ""]
+    return lines + [line for name in there for line in (f"![{plan['title']}](pictures/{name})", "")]
 
 
 def section(results: Results) -> list[str]:
     """One figure in numbers."""
     plan = results.plan
-    lines = [f"### {plan['title']} ({plan['figure']}, {plan['scale']} scale)", ""]
+    lines = [f"### {plan['title']} ({plan['figure']}, {results.edition.called})", ""]
     labels = {run["env"]: (run["env_label"], run["physics"]) for run in plan["runs"]}
     for env, (label, physics) in labels.items():
         rows = performance(results, env)
@@ -93,7 +95,7 @@ def untrained(results: Results) -> list[str]:
 def table_section(results: Results) -> list[str]:
     """One table of the paper: the mean over seeds of every quantity, as measured."""
     plan = results.plan
-    lines = [f"### {plan['title']} ({plan['figure']}, {plan['scale']} scale)", ""]
+    lines = [f"### {plan['title']} ({plan['figure']}, {results.edition.called})", ""]
     labels = {(run["env"], run["variant"]): f"{run['env_label']}, {run['variant_label']}" for run in plan["runs"]}
     shown = {
         key: label for key, label in labels.items() if key in set(results.frame.groupby(["env", "variant"]).groups)
