@@ -1,10 +1,11 @@
-"""What the committed results say, as a page: `make results` writes docs/results.md and the pictures beside it.
+"""What the committed results say: `make results` writes docs/results.md, its pictures and the README's verdicts.
 
 Only rows under paper_figures/data count, never what happens to be trained here; scales and protocols are never
 pooled.
 """
 
 import argparse
+import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,7 +17,7 @@ from analysis.claims import CLAIMS, in_words, paper_values, ruled, tally, verdic
 from analysis.command_line import PROTOCOLS
 from analysis.edition import PAPER, Edition
 from analysis.runs import MissingData, Results, load, scores
-from analysis.verdicts import Ruling
+from analysis.verdicts import NOT_REPRODUCED, REPRODUCED, Ruling
 
 ROOT = Path(__file__).parent.parent
 DATA = ROOT / "paper_figures" / "data"
@@ -31,6 +32,7 @@ NUMBERS = """Final: return over the last 10 % of iterations, mean ± standard de
 first 10 %, for methods do not start alike. Area: mean return over all iterations. The pictures' curves are smoothed
 ([reproduce.md](reproduce.md)), the numbers are not.
 """
+MARK = re.compile(r"(<!-- verdicts -->\n).*?(<!-- end -->)", re.DOTALL)
 CALLED = {PAPER: "as printed"}  # protocols, in the table of verdicts
 
 
@@ -126,18 +128,25 @@ def rulings_of(everything: Everything, protocol: str) -> list[tuple[Ruling, Edit
     return result
 
 
-def verdicts(rulings: Rulings) -> list[str]:
-    """All claims at a glance: a line per protocol and a table with a row per claim."""
-    protocols = list(rulings)
-    names = [CALLED.get(protocol, protocol) for protocol in protocols]
-    lines = ["## Verdicts", ""]
-    for protocol, name in zip(protocols, names, strict=True):
-        lines.append(f"* **{name}**: {tally([ruling for ruling, _ in rulings[protocol]])}.")
-    lines += ["", "How a verdict is drawn, and how often it errs: [verdicts.md](verdicts.md).", ""]
-    lines += [f"| sentence | where | {' | '.join(names)} |", "|---|---|" + "---|" * len(names)]
+def called(protocol: str) -> str:
+    """A protocol, as tables have it."""
+    return CALLED.get(protocol, protocol)
+
+
+def verdicts(rulings: Rulings, only_decided: bool = False) -> list[str]:
+    """All claims at a glance: a line per protocol and a table with a row per claim.
+
+    Args:
+        only_decided: rows of claims that some protocol decides, in every environment or where it was trained.
+    """
+    lines = [f"* **{called(protocol)}**: {tally([r for r, _ in of])}." for protocol, of in rulings.items()]
+    names = [called(protocol) for protocol in rulings]
+    lines += ["", f"| sentence | where | {' | '.join(names)} |", "|---|---|" + "---|" * len(names)]
     for i, claim in enumerate(CLAIMS):
-        cells = [verdict_of(rulings[protocol][i][0]) for protocol in protocols]
-        lines.append(f"| {claim.sentence} | {claim.source} | {' | '.join(cells)} |")
+        of_claim = [of[i][0] for of in rulings.values()]
+        if only_decided and not any({r.verdict, r.where_trained} & {REPRODUCED, NOT_REPRODUCED} for r in of_claim):
+            continue
+        lines.append(f"| {claim.sentence} | {claim.source} | {' | '.join(map(verdict_of, of_claim))} |")
     return [*lines, ""]
 
 
@@ -157,8 +166,8 @@ def differences(rulings: Rulings) -> list[str]:
     return [*lines, ""]
 
 
-def page(runs_dir: Path, data: Path, pictures: Path) -> str:
-    """The whole page, from plans in `runs_dir` (for names only) and rows in `data`."""
+def load_all(runs_dir: Path, data: Path) -> Everything:
+    """All committed rows, from plans in `runs_dir` (for names only) and rows in `data`."""
     everything: Everything = {}
     for edition in (Edition(scale, protocol) for protocol in PROTOCOLS for scale in SCALES):
         for path in sorted((data / edition.folder).glob("*.csv")):
@@ -169,10 +178,16 @@ def page(runs_dir: Path, data: Path, pictures: Path) -> str:
             except MissingData as error:
                 raise ValueError(f"{path}: {error}") from error
             everything.setdefault(edition, {})[path.stem] = results
+    return everything
+
+
+def pages(everything: Everything, pictures: Path) -> tuple[str, str]:
+    """The results page, and what the README says of it."""
     if not everything:
-        return f"{HEAD}\nNo results are committed yet.\n"
+        return f"{HEAD}\nNo results are committed yet.\n", "No results are committed yet.\n"
     rulings = {e.protocol: rulings_of(everything, e.protocol) for e in everything}
-    lines = [HEAD, *verdicts(rulings), "## Pictures", ""]
+    rule = ["How a verdict is drawn, and how often it errs: [verdicts.md](verdicts.md).", ""]
+    lines = [HEAD, "## Verdicts", "", *rule, *verdicts(rulings), "## Pictures", ""]
     for of_edition in everything.values():
         for results in of_edition.values():
             lines += picture(results, pictures)
@@ -183,7 +198,7 @@ def page(runs_dir: Path, data: Path, pictures: Path) -> str:
         for name, results in of_edition.items():
             lines += section(results) if name in curves else table_section(results)
     lines += differences(rulings)
-    return "\n".join(lines).rstrip() + "\n"
+    return "\n".join(lines).rstrip() + "\n", "\n".join(verdicts(rulings, only_decided=True))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -192,14 +207,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--runs-dir", type=Path, required=True, help="folder of the plans, without runs")
     parser.add_argument("--data", type=Path, default=DATA)
     parser.add_argument("--docs", type=Path, default=ROOT / "docs")
+    parser.add_argument("--readme", type=Path, default=ROOT / "README.md", help="with a part for the verdicts")
     options = parser.parse_args(arguments)
     try:
-        text = page(options.runs_dir, options.data, options.docs / "pictures")
+        text, summary = pages(load_all(options.runs_dir, options.data), options.docs / "pictures")
     except ValueError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     (options.docs / "results.md").write_text(text)
-    print(f"wrote {options.docs / 'results.md'}")
+    options.readme.write_text(MARK.sub(lambda m: f"{m[1]}{summary}{m[2]}", options.readme.read_text()))
+    print(f"wrote {options.docs / 'results.md'} and the verdicts of {options.readme}")
     return 0
 
 

@@ -138,7 +138,7 @@ def decide(comparisons: Mapping[str, Comparison], missing: list[str], needed: in
     if joined(lambda c: c.better, needed) <= ALPHA:
         return REPRODUCED, ""
     if joined(lambda c: c.worse, against) <= ALPHA:
-        return NOT_REPRODUCED, "the opposite"
+        return NOT_REPRODUCED, "the opposite is shown"
     if joined(lambda c: c.short, against) <= ALPHA:
         return NOT_REPRODUCED, f"no difference of {NOTABLE:.0%} or more"
     seeds = max((c.needed for c in comparisons.values() if c.verdict == INCONCLUSIVE), default=float("nan"))

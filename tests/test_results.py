@@ -39,7 +39,7 @@ def committed(tmp_path, scale="laptop"):
 
 def test_final_and_area_by_hand(tmp_path):
     committed(tmp_path)
-    page = results.page(tmp_path, tmp_path / "data", tmp_path)
+    page, summary = results.pages(results.load_all(tmp_path, tmp_path / "data"), tmp_path)
     # Last 10 %: 9 and 19, whose deviation is sqrt(50); first: 0 and 10; areas: 4.5 and 14.5.
     assert "| PPO | 2 | 0.0 M | 14.00 ± 7.07 | 9.00 ± 0.00 | 9.50 ± 7.07 |" in page
     assert "### A title (fig3, laptop scale)" in page
@@ -47,10 +47,12 @@ def test_final_and_area_by_hand(tmp_path):
     assert len(rows) == len(claims.CLAIMS)  # one is decided by arithmetic
     everything = len(claims.CLAIMS)
     assert f"{everything} claims: 0 reproduced, 1 not reproduced, {everything - 1} undecided." in page
+    assert len([line for line in summary.splitlines() if line.startswith("| ")]) == 2  # the head, and that one
 
 
 def test_without_committed_rows_it_says_so(tmp_path):
-    assert "No results are committed yet." in results.page(tmp_path, tmp_path / "data", tmp_path)
+    for text in results.pages(results.load_all(tmp_path, tmp_path / "data"), tmp_path):
+        assert "No results are committed yet." in text
 
 
 def test_rows_without_a_plan_are_one_clear_error(tmp_path, capsys):
@@ -67,7 +69,9 @@ def test_the_committed_page_is_fresh(tmp_path):
         for path in tables(edition):
             make_plan(path.stem, edition.scale, [], False, tmp_path, edition.protocol).write(tmp_path)
     written = (ROOT / "docs" / "results.md").read_text()
-    assert results.page(tmp_path, results.DATA, ROOT / "docs" / "pictures") == written, "run `make results`"
+    page, summary = results.pages(results.load_all(tmp_path, results.DATA), ROOT / "docs" / "pictures")
+    assert page == written, "run `make results`"
+    assert results.MARK.search((ROOT / "README.md").read_text())[0].split("-->\n")[1] == summary + "<!-- end -->"
 
 
 @pytest.mark.parametrize("edition", EDITIONS, ids=str)

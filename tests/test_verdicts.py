@@ -65,7 +65,7 @@ def test_all_needs_every_place_and_one_opposite_disproves_it():
     assert rule({"a": good, "b": good}, ("a", "b"), 2).verdict == REPRODUCED
     assert rule({"a": good, "b": noise}, ("a", "b"), 2).verdict == INCONCLUSIVE
     opposite = rule({"a": good, "b": bad}, ("a", "b"), 2)
-    assert (opposite.verdict, opposite.why) == (NOT_REPRODUCED, "the opposite")
+    assert (opposite.verdict, opposite.why) == (NOT_REPRODUCED, "the opposite is shown")
     same = compare(around(10), around(10), 0.1)
     assert rule({"a": same, "b": same}, ("a", "b"), 2).why == "no difference of 10% or more"
 
