@@ -149,8 +149,8 @@ def rows_of(study: Study, entry: Entry) -> pd.DataFrame:
 def table(study: Study, frame: pd.DataFrame) -> list[str]:
     """Final return and area of every variant, mean ± standard deviation over seeds, as Markdown lines.
 
-    The score is the area relative to the mean over all variants in that environment, mean over environments: the
-    variant with the highest in its group is bold.
+    The score is the area relative to the mean over all variants in that environment, mean over environments; of those
+    that `over` makes of one variant the highest is bold.
     """
     environments = list(study.description["environments"])
     labels = dict.fromkeys((e.group, e.label) for e in study.entries)
@@ -169,10 +169,8 @@ def table(study: Study, frame: pd.DataFrame) -> list[str]:
         for _, label in labels
         if all(counts[label, env] for env in environments)
     }
-    best = {
-        max((label for g, label in labels if g == group and label in score), key=score.__getitem__, default="")
-        for group, _ in labels
-    }
+    groups = {group: [label for g, label in labels if g == group] for group, _ in labels}
+    best = {max(of, key=lambda label: score.get(label, -np.inf)) for of in groups.values() if len(of) > 1}
     heads = [f"{env_label(env)}: seeds | final | area" for env in environments]
     lines = [f"| variant | {' | '.join(heads)} | score |", "|---|" + "---|" * (3 * len(environments) + 1)]
     for _, label in labels:
