@@ -28,7 +28,7 @@ from experiments import synonyms
 from hippo.core.settings import ConfigError, setting
 from hippo.core.skills import SkillsError, read_skills
 from hippo.envs import ENVIRONMENTS
-from hippo.envs.registration import Options, check_option
+from hippo.envs.registration import Options, check_options
 
 CONF = Path(__file__).parent / "conf"
 COMMITTED = Path(__file__).parent.parent / "paper_figures" / "data"
@@ -464,14 +464,13 @@ def _validated(config: DictConfig, algo: str, names: dict[str, str]) -> Run:
     env: dict[str, Any] = plain["env"]
     with _of_algo():
         settings = config_class(algo)(**plain["algo"])
-    options = {}
-    for f in dataclasses.fields(Options):
-        if env[f.name] != f.default:
-            try:
-                check_option(env["name"], f.name, env[f.name])
-            except ValueError as error:
-                raise ConfigError(f"env.{f.name}", env[f.name], str(error).split(": ", 1)[1]) from error
-            options[f.name] = env[f.name]
+    options = {f.name: env[f.name] for f in dataclasses.fields(Options) if env[f.name] != f.default}
+    try:
+        check_options(env["name"], options)
+    except ValueError as error:
+        setting, valid = str(error).split(": ", 1)
+        name = setting.split("=", 1)[0]
+        raise ConfigError(f"env.{name}", env[name], valid) from error
     if hasattr(settings, "check_environment"):
         with _of_algo():
             settings.check_environment(ENVIRONMENTS[env["name"]].robot, options)

@@ -107,8 +107,9 @@ def perturbations() -> str:
 def changes_dynamics(name: str, quantity: str, strength: str) -> bool:
     """Whether `STEPS` random steps end in another state."""
     states = []
-    for perturbation in (None, quantity):
-        envs = make(name, 2, 0, perturbation=perturbation, strength=strength)
+    changes: dict[str, Any] = {"perturbation": quantity, "strength": strength}
+    for options in ({}, changes):
+        envs = make(name, 2, 0, **options)
         rng = np.random.default_rng(0)
         envs.reset(seed=0)
         for _ in range(STEPS):

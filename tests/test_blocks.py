@@ -41,7 +41,8 @@ def test_heights_are_uniform_in_the_tracks_range():
 
 def driven(xs, robot="hopper"):
     """Rewards of a Block task whose robot's centre of mass is moved along `xs`."""
-    task = blocks.Blocks(SimpleNamespace(name=robot), SimpleNamespace(terminate_on_fall=False), 1)
+    options = SimpleNamespace(terminate_on_fall=False, terminate_on_tumble=False)
+    task = blocks.Blocks(SimpleNamespace(name=robot), options, 1)
     task.physics, task.com = SimpleNamespace(mocap_pos=np.zeros((1, 12, 3))), np.zeros((1, 3))
     task.reset(np.array([0]), [np.random.default_rng(0)])
     rewards = []
@@ -158,3 +159,20 @@ def test_nothing_but_the_horizon_ends_an_episode_unless_falling_does():
             ended |= bool(terminated.any())
             assert not truncated.any()
         assert ended is expected
+
+
+@pytest.mark.parametrize("name", ["block_hopper", "block_half_cheetah"])
+@pytest.mark.parametrize("option", ["terminate_on_tumble", "terminate_on_fall", None])
+def test_a_tumble_ends_the_episode_where_asked_to_and_its_wall_is_paid(name, option):
+    env = make(name, 4, 0, **({option: True} if option else {}))
+    env.reset(seed=0)
+    env.physics.qpos[:, 2] = [0.97, 1.1, -0.97, -1.1]  # the pitch moves by less than 0.03 rad in a step
+    env.physics.qvel[:] = 0.0
+    env.physics.qpos[:, 0 if name == "block_half_cheetah" else 1] = 2.9  # the first wall is behind
+    env.physics.forward(np.arange(4))
+    _, reward, terminated, truncated, _ = env.step(np.zeros(env.action_space.shape))
+    tumbled, fallen = [False, True, False, True], [name == "block_hopper"] * 4
+    expected = {"terminate_on_tumble": tumbled, "terminate_on_fall": fallen, None: [False] * 4}
+    assert terminated.tolist() == expected[option]
+    assert reward.tolist() == [1.0] * 4
+    assert not truncated.any()

@@ -97,6 +97,7 @@ WRONG = [
     (["seed=1,2"], "seed=1,2"),
     (["env.physics=slow"], "env.physics=slow"),
     (["env.walls=true"], "env.walls=True"),
+    (["env.strength=all"], "env.strength=all: changes nothing without a perturbation"),
     (["algo.num_skills=2.5"], "algo.num_skills=2.5"),
     (["algo.skill_hidden_sizes=[64,a]"], "algo.skill_hidden_sizes"),
     (["wandb.mode=sometimes"], "wandb.mode=sometimes: valid: disabled, offline, online"),

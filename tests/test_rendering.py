@@ -1,5 +1,7 @@
 """Pictures: what a person must be able to tell apart is there, in the colours and places it has; videos; pages."""
 
+import os
+import shutil
 import subprocess
 import sys
 import tracemalloc
@@ -95,6 +97,68 @@ def test_a_window_without_a_display_is_refused_in_words(monkeypatch):
     env = gym.make("hippo/BlockHopper-v0", render_mode="human", disable_env_checker=True)
     with pytest.raises(NoOpenGL, match="needs a display"):
         env.reset(seed=0)
+    env.close()
+
+
+@pytest.fixture(scope="module")
+def display():
+    """The name of a display without a screen."""
+    if not shutil.which("Xvfb"):
+        pytest.skip("no Xvfb here (apt-get install xvfb libgl1)")
+    read, write = os.pipe()
+    command = ["Xvfb", "-displayfd", str(write), "-screen", "0", "800x600x24", "-nolisten", "tcp"]
+    server = subprocess.Popen(command, pass_fds=[write], stderr=subprocess.DEVNULL)
+    os.close(write)
+    with os.fdopen(read) as lines:
+        number = lines.readline().strip()
+    if not number:
+        pytest.skip("Xvfb does not start here")
+    yield f":{number}"
+    server.terminate()
+    server.wait()
+
+
+IN_A_WINDOW = """
+import sys, time
+import gymnasium, mujoco, numpy
+import hippo.envs
+from hippo.envs.rendering import NoOpenGL
+try:
+    env = gymnasium.make("hippo/BlockHopper-v0", render_mode="human", disable_env_checker=True)
+    env.reset(seed=0)
+except NoOpenGL as error:
+    sys.exit(f"skip: {error}")
+renderer = env.unwrapped._viewer._renderer
+renderer.put(renderer.frame(0))
+seen = numpy.empty((renderer._rectangle.height, renderer._rectangle.width, 3), numpy.uint8)
+mujoco.mjr_readPixels(seen, None, renderer._rectangle, renderer._mujoco)
+numpy.save(sys.argv[1], seen[::-1])
+start = time.perf_counter()
+for _ in range(6):
+    env.step(numpy.zeros(3))
+print(time.perf_counter() - start)
+if sys.argv[2] == "close":
+    env.close()
+    env.close()
+"""
+
+
+@needs_gl
+@pytest.mark.parametrize("end", ["close", "leave open"])
+def test_a_window_shows_the_frames_at_their_pace_and_ends_without_a_crash(end, display, tmp_path):
+    path = tmp_path / "seen.npy"
+    command = [sys.executable, "-c", IN_A_WINDOW, str(path), end]
+    result = subprocess.run(command, env=os.environ | {"DISPLAY": display}, capture_output=True, text=True, cwd=ROOT)
+    if result.stderr.startswith("skip: "):
+        pytest.skip(result.stderr)
+    assert (result.returncode, result.stderr) == (0, "")
+    assert float(result.stdout) > 5 / 50  # six steps of 0.02 s, of which the first is shown at once
+    env = gym.make("hippo/BlockHopper-v0", render_mode="rgb_array")
+    env.reset(seed=0)
+    assert np.abs(env.render().astype(int) - np.load(path)).mean() < 1
+    env.close()
+    with pytest.raises(gym.error.ClosedEnvironmentError):
+        env.render()
 
 
 def test_without_opengl_the_error_names_the_remedy_and_figure_2_shows_committed_frames(tmp_path):

@@ -261,6 +261,19 @@ def test_nothing_is_compiled_but_for_one_and_for_many_simulations_however_the_ac
         ("snake_gather", {"velocity_penalty": "yes"}, "velocity_penalty=yes"),
         ("block_hopper", {"perturbation": "mass"}, "strength=original"),
         ("snake_gather", {"perturbation": "colour"}, "perturbation=colour"),
+        ("ant_gather", {"horizon": 10**20}, "horizon=100000000000000000000: must be at most"),
+        ("ant_gather", {"num_envs": 10**20}, "num_envs=100000000000000000000: must be at most"),
+        ("ant_gather", {"num_threads": 2**31}, "num_threads=2147483648: must be at most"),
+        ("ant_gather", {"num_envs": np.array([2])}, "num_envs="),
+        ("ant_gather", {"num_envs": np.True_}, "num_envs=True"),
+        ("ant_gather", {"autoreset": "no"}, "autoreset=no: must be one of True, False, NextStep"),
+        ("ant_gather", {"autoreset": None}, "autoreset=None"),
+        ("ant_gather", {"autoreset": 1}, "autoreset=1"),
+        ("snake_gather", {"walls": 1}, "walls=1"),
+        ("snake_gather", {"walls": np.array([True, False])}, "walls="),
+        ("snake_gather", {"walls": []}, "walls="),
+        ("ant_gather", {"strength": "all"}, "strength=all: changes nothing without a perturbation"),
+        ("block_hopper", {"strength": "all", "perturbation": None}, "strength=all"),
     ],
 )
 def test_bad_arguments_are_refused_by_name(name, arguments, message):
@@ -286,6 +299,11 @@ def test_bad_calls_are_refused():
         env.step(np.array([[0.0, np.nan, 0.0], [0.0, 0.0, 0.0]]))
     with pytest.raises(ValueError, match="2 non-finite"):
         env.step(np.array([[0.0, np.inf, 0.0], [0.0, 0.0, -np.inf]]))
+    for bad in (np.zeros((2, 3), complex), [[1j] * 3] * 2, np.full((2, 3), "0.5"), np.full((2, 3), None)):
+        with pytest.raises(ValueError, match=r"actions are of type .*; expected real numbers"):
+            env.step(bad)
+    with pytest.raises(ValueError, match="layout_seed=-1"):
+        env.reset(seed=3, options={"layout_seed": -1})
     clean = make("block_hopper", 2, 0)
     clean.reset(seed=0)
     assert same([clean.step(np.ones((2, 3)))], [env.step(np.ones((2, 3)))])  # what was refused left no trace

@@ -20,6 +20,8 @@ RING = 12  # walls in the simulation at a time
 BEHIND = 4  # of which behind the robot
 HALF_HEIGHT = 1.0  # m; a wall is a tall box sunk to its height
 HALF_WIDTH = 5.0  # m across the track
+PITCH = 2  # of qpos, of either robot
+TUMBLED = 1.0  # rad; the torso has left upright by more
 NUM_HEIGHTS = 512  # heights drawn per episode; the sequence repeats after 1 km, twice what any robot can run
 
 
@@ -141,7 +143,8 @@ class Blocks:
     pays_for_speed = False
 
     def __init__(self, robot: Robot, options: Any, num_envs: int) -> None:
-        self.robot, self.track, self.terminate_on_fall = robot, TRACKS[robot.name], options.terminate_on_fall
+        self.robot, self.track = robot, TRACKS[robot.name]
+        self.terminate_on_fall, self.terminate_on_tumble = options.terminate_on_fall, options.terminate_on_tumble
         self.heights = np.zeros((num_envs, NUM_HEIGHTS))  # (N, NUM_HEIGHTS) m
         self.cleared = np.zeros(num_envs, np.int64)  # (N,) walls paid for
         self.ahead = np.zeros(num_envs, np.int64)  # (N,) index of the next wall
@@ -193,6 +196,8 @@ class Blocks:
         reward, boxes = np.empty(len(x)), self.physics.mocap_pos
         _run(x, self.heights, self.track.first_wall, self.ahead, self.cleared, boxes, reward)
         terminated = self._fallen() if self.terminate_on_fall else np.zeros(len(x), bool)
+        if self.terminate_on_tumble:
+            terminated |= np.abs(self.physics.qpos[:, PITCH]) > TUMBLED
         return reward.copy(), terminated, {"reward_walls": reward}
 
     def _fallen(self) -> np.ndarray:

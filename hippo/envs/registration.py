@@ -1,13 +1,13 @@
 """The environments by name: robot, task, horizon, and which options each of them has."""
 
 import dataclasses
-import functools
 from dataclasses import dataclass
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
+from hippo.envs.arguments import LARGEST_INT, LARGEST_LONG, autoreset_mode, natural, plain
 from hippo.envs.blocks import Blocks
 from hippo.envs.gather import Gather
 from hippo.envs.locomote import SURVIVAL, Locomotion
@@ -34,6 +34,7 @@ class Options:
     walls: bool = option(False, "Snake Gather (ours): the arena's walls hold the Snake; they always hold the Ant")
     position: bool = option(False, "Gather: append the torso's absolute x, y to the observation, for HIRO (Fig. 7)")
     terminate_on_fall: bool = option(False, "Block: rllab's conditions; the paper names none")
+    terminate_on_tumble: bool = option(False, "Block (ours): a torso more than 1 rad from upright ends the episode")
 
 
 @dataclass(frozen=True)
@@ -52,6 +53,8 @@ class Environment:
         return self.task is not Locomotion or self.robot in SURVIVAL
 
 
+RENAMED = {"max_episode_steps": "horizon", "autoreset_mode": "autoreset"}  # Gymnasium's words, to whom they occur
+
 _SHARED = {"perturbation": (None, *PERTURBATIONS), "strength": STRENGTHS}
 _SWITCH = (False, True)
 _ALONE = _SHARED  # the robots without a task, for the pre-training of skills
@@ -61,7 +64,12 @@ _GATHER = _SHARED | {
     "grid": ("original", "symmetric"),
     "physics": ("paper", "fast"),
 }
-_BLOCK = _SHARED | {"terminate_on_fall": _SWITCH, "physics": ("paper",), "observation": ("paper",)}
+_BLOCK = _SHARED | {
+    "terminate_on_fall": _SWITCH,
+    "terminate_on_tumble": _SWITCH,
+    "physics": ("paper",),
+    "observation": ("paper",),
+}
 
 ENVIRONMENTS = {
     "ant_gather": Environment("ant", Gather, 5000, 1, _GATHER | {"observation": ("paper",)}),
@@ -87,7 +95,7 @@ def make(
     seed: int,
     num_threads: int = 1,
     horizon: int | None = None,
-    autoreset: bool = True,
+    autoreset: bool | str | gym.vector.AutoresetMode = True,
     **options: Any,
 ) -> RobotTaskEnv:
     """Build a vector environment.
@@ -96,7 +104,8 @@ def make(
         name: a key of ENVIRONMENTS. num_envs: simulations. seed: environment i draws from `seed + i`.
         num_threads: that MuJoCo steps on; results do not depend on it.
         horizon: steps to truncation instead of the environment's own. autoreset: whether ended episodes are followed
-        by new ones in the same step. options: fields of Options.
+        by new ones in the same step (True), when the caller resets them (False), or a mode of Gymnasium's by its value
+        ("NextStep": in the next step). options: fields of Options. numpy's scalars count as Python's.
 
     Raises:
         ValueError: a name, option or value that does not exist; the message names it and the valid ones.
@@ -104,22 +113,17 @@ def make(
     if name not in ENVIRONMENTS:
         raise ValueError(f"env={name}: must be one of {', '.join(ENVIRONMENTS)}")
     environment = ENVIRONMENTS[name]
-    horizon = environment.horizon if horizon is None else horizon
-    for key, number in (("num_envs", num_envs), ("horizon", horizon), ("num_threads", num_threads)):
-        if isinstance(number, bool) or not isinstance(number, int) or number < 1:
-            raise ValueError(f"{key}={number}: must be an integer of at least 1")
-    for key, value in options.items():
-        check_option(name, key, value)
+    options = check_options(name, options)
     return RobotTaskEnv(
         ROBOTS[environment.robot],
         environment.task,
         dataclasses.replace(Options(), **options),
-        num_envs,
-        seed,
-        horizon,
+        natural("num_envs", num_envs, 1, LARGEST_INT),
+        natural("seed", seed),
+        natural("horizon", environment.horizon if horizon is None else horizon, 1, LARGEST_LONG),
         environment.revision,
-        num_threads,
-        autoreset,
+        natural("num_threads", num_threads, 1, LARGEST_INT),
+        autoreset_mode(autoreset),
     )
 
 
@@ -128,22 +132,51 @@ def gymnasium_id(name: str) -> str:
     return f"hippo/{name.title().replace('_', '')}-v{ENVIRONMENTS[name].revision - 1}"
 
 
-def make_single(name: str, render_mode: str | None = None, **options: Any) -> Any:
-    """The environment as a gymnasium.Env; arguments as `make`. Unseeded resets start from the machine's entropy."""
-    from hippo.envs.single import SingleEnv
+def make_single(name: str, render_mode: str | None = None, seed: int | None = None, **options: Any) -> Any:
+    """The environment as a gymnasium.Env, for `gymnasium.make`; arguments as `make`.
 
-    return SingleEnv(make(name, 1, entropy(), autoreset=False, **options), render_mode)
-
-
-def make_several(name: str, num_envs: int = 1, render_mode: str | None = None, **options: Any) -> RobotTaskEnv:
-    """The environment as a gymnasium.vector.VectorEnv, for `gymnasium.make_vec`; arguments as `make`.
+    The end of an episode is Gymnasium's TimeLimit, as for its own robots: `max_episode_steps` moves it. A shorter
+    `horizon` ends it within. An unseeded environment starts from the machine's entropy.
 
     Raises:
-        ValueError: a render mode; a single environment renders.
+        ValueError: what `make` refuses; what a single environment does not have; a horizon beyond the limit.
+    """
+    from hippo.envs.single import SingleEnv
+
+    limit = ENVIRONMENTS[name].horizon
+    for key, instead in (("num_envs", "gymnasium.make_vec makes several"), ("autoreset", "call reset()")):
+        if key in options:
+            raise ValueError(f"{key}={options[key]}: gymnasium.make takes none; {instead}")
+    options["horizon"] = LARGEST_LONG if options.get("horizon") is None else natural("horizon", options["horizon"], 1)
+    if limit < options["horizon"] < LARGEST_LONG:
+        raise ValueError(f"horizon={options['horizon']}: gymnasium.make ends it after {limit}; give max_episode_steps")
+    return SingleEnv(make(name, 1, entropy() if seed is None else seed, autoreset=False, **options), render_mode)
+
+
+def make_several(
+    name: str,
+    num_envs: int = 1,
+    render_mode: str | None = None,
+    seed: int | None = None,
+    max_episode_steps: int | None = None,
+    **options: Any,
+) -> RobotTaskEnv:
+    """The environment as a gymnasium.vector.VectorEnv, for `gymnasium.make_vec`; arguments as `make`.
+
+    Args:
+        max_episode_steps: Gymnasium's word for the horizon, which it always gives.
+
+    Raises:
+        ValueError: what `make` refuses; a render mode, since a single environment renders; two different horizons.
     """
     if render_mode is not None:
         raise ValueError(f"render_mode={render_mode}: a vector environment has none; use gymnasium.make")
-    return make(name, num_envs, entropy(), **options)
+    if max_episode_steps is not None:
+        limit = natural("max_episode_steps", max_episode_steps, 1, LARGEST_LONG)
+        horizon = options.setdefault("horizon", limit)
+        if limit not in (ENVIRONMENTS[name].horizon, horizon):
+            raise ValueError(f"max_episode_steps={limit}: is the horizon, which is given as {horizon}")
+    return make(name, num_envs, entropy() if seed is None else seed, **options)
 
 
 def entropy() -> int:
@@ -156,15 +189,28 @@ def register() -> None:
     for name in ENVIRONMENTS:
         gym.register(
             gymnasium_id(name),
-            entry_point=functools.partial(make_single, name),
-            vector_entry_point=functools.partial(make_several, name),
+            entry_point=f"{__name__}:make_single",
+            vector_entry_point=f"{__name__}:make_several",
+            max_episode_steps=ENVIRONMENTS[name].horizon,
+            kwargs={"name": name},
         )
 
 
-def check_option(name: str, key: str, value: Any) -> None:
-    """Raise ValueError unless `key` is an option of environment `name` and `value` one of its values."""
-    valid = ENVIRONMENTS[name].options
+def check_option(name: str, key: str, value: Any) -> Any:
+    """`value` as option `key` of environment `name`, a Python value for numpy's; ValueError if it is none."""
+    valid, value = ENVIRONMENTS[name].options, plain(value)
     if key not in valid:
-        raise ValueError(f"{key}={value}: {name} has no such option; its options are {', '.join(valid)}")
-    if value not in valid[key] or isinstance(value, bool) != isinstance(valid[key][0], bool):
+        hint = RENAMED.get(key)
+        instead = f"its name here is {hint}" if hint else f"its options are {', '.join(valid)}"
+        raise ValueError(f"{key}={value}: {name} has no such option; {instead}")
+    if not any(type(value) is type(one) and value == one for one in valid[key]):
         raise ValueError(f"{key}={value}: {name} takes one of {', '.join(map(str, valid[key]))}")
+    return value
+
+
+def check_options(name: str, options: dict[str, Any]) -> dict[str, Any]:
+    """`options` of environment `name` as Python values; ValueError if one is none or, beside the others, idle."""
+    options = {key: check_option(name, key, value) for key, value in options.items()}
+    if options.get("strength", Options.strength) != Options.strength and options.get("perturbation") is None:
+        raise ValueError(f"strength={options['strength']}: changes nothing without a perturbation")
+    return options

@@ -58,18 +58,22 @@ def open_gl() -> str:
 
 
 class Renderer:
-    """Frames of one simulation at a time, off screen."""
+    """Frames of one simulation at a time, off screen.
 
-    def __init__(self, envs: Scene, width: int = 640, height: int = 480) -> None:
+    Args:
+        context: an OpenGL context to draw in instead of one of its own.
+    """
+
+    def __init__(self, envs: Scene, width: int = 640, height: int = 480, context: Any = None) -> None:
         self.envs, self._model = envs, lit(envs.physics.model)
         model = self._model
-        back_end = open_gl()
-        self._context = importlib.import_module(f"mujoco.{back_end}").GLContext(width, height)
+        if context is None:
+            context = importlib.import_module(f"mujoco.{open_gl()}").GLContext(width, height)
+        self._context = context
         self._context.make_current()
         model.vis.global_.offwidth, model.vis.global_.offheight = width, height
         self._scene = mujoco.MjvScene(model, maxgeom=1000)
         self._mujoco = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
-        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._mujoco)
         self._option, self._rectangle = mujoco.MjvOption(), mujoco.MjrRect(0, 0, width, height)
         self.camera = mujoco.MjvCamera()
         aim(self.camera, envs)
@@ -80,6 +84,7 @@ class Renderer:
         mujoco.mj_forward(model, data)
         follow(self.camera, self.envs, env)
         self._context.make_current()
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._mujoco)
         every = mujoco.mjtCatBit.mjCAT_ALL
         mujoco.mjv_updateScene(model, data, self._option, None, self.camera, every, self._scene)
         shade(self._scene, has_shadows=not isinstance(self.envs.task, Gather))  # rays would throw them too
@@ -92,44 +97,16 @@ class Renderer:
         image[depth == 1] = SKY
         return image[::-1].copy()
 
+    def put(self, image: np.ndarray) -> None:
+        """Draw a frame into the context's window."""
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_WINDOW, self._mujoco)
+        mujoco.mjr_drawPixels(image[::-1].ravel(), None, self._rectangle, self._mujoco)
+
     def close(self) -> None:
         """Release the graphics memory."""
         self._context.make_current()
         self._mujoco.free()
         self._context.free()
-
-
-class Viewer:
-    """A window that shows one simulation, where there is a display.
-
-    Raises:
-        NoOpenGL: there is no display.
-    """
-
-    def __init__(self, envs: Scene) -> None:
-        if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-            raise NoOpenGL("render_mode=human needs a display; use rgb_array, or `make video RUN=...`")
-        from mujoco import viewer
-
-        self.envs, self._data = envs, mujoco.MjData(envs.physics.model)
-        self._window = viewer.launch_passive(envs.physics.model, self._data, show_left_ui=False, show_right_ui=False)
-        aim(self._window.cam, envs)
-
-    def show(self, env: int) -> None:
-        """Bring the window up to date with simulation `env`."""
-        with self._window.lock():
-            data = self.envs.physics.data(env)
-            self._data.qpos[:], self._data.mocap_pos[:] = data.qpos, data.mocap_pos
-            mujoco.mj_forward(self.envs.physics.model, self._data)
-            follow(self._window.cam, self.envs, env)
-            self._window.user_scn.ngeom = 0
-            draw_floor(self._window.user_scn, self.envs, env)
-            draw_task(self._window.user_scn, self.envs, env)
-        self._window.sync()
-
-    def close(self) -> None:
-        """Close the window."""
-        self._window.close()
 
 
 def lit(model: mujoco.MjModel) -> mujoco.MjModel:

@@ -70,6 +70,11 @@ def quaternion_yaw(qpos: np.ndarray) -> np.ndarray:
     return yaw
 
 
+def first_heading(qpos: np.ndarray) -> np.ndarray:
+    """Direction of the first link of a planar chain: qpos[:, 2], (N,) rad."""
+    return qpos[:, 2]
+
+
 @numba.njit(cache=True, error_model="numpy")
 def _quaternion_yaw(qpos: np.ndarray, yaw: np.ndarray) -> None:
     """Write `quaternion_yaw` to yaw (N,)."""
@@ -134,7 +139,7 @@ SNAKE = Robot(
             _velocities(f"x y heading {SNAKE_JOINTS}"),
         ),
     },
-    lambda qpos: qpos[:, 2],
+    first_heading,
 )
 HOPPER = Robot(
     "hopper",

@@ -5,7 +5,8 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from hippo.envs.rendering import Renderer, Viewer
+from hippo.envs.arguments import natural
+from hippo.envs.rendering import Renderer
 from hippo.envs.vector import RENDER_MODES, RobotTaskEnv
 
 
@@ -26,10 +27,11 @@ class SingleEnv(gym.Env):
         self.envs, self.render_mode, self.metadata = envs, render_mode, envs.metadata
         self.observation_space, self.action_space = envs.single_observation_space, envs.single_action_space
         self._renderer: Renderer | None = None
-        self._viewer: Viewer | None = None
+        self._viewer: Any = None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
         """Start a new episode; `seed` and `options` as in RobotTaskEnv.reset."""
+        seed = natural("seed", seed, may_be_none=True)
         super().reset(seed=seed)
         obs, info = self.envs.reset(seed=seed, options=options)
         self._show()
@@ -43,6 +45,7 @@ class SingleEnv(gym.Env):
 
     def render(self) -> np.ndarray | None:
         """The current frame, (H, W, 3) uint8, in rgb_array mode; None otherwise."""
+        self.envs.check_open()
         if self.render_mode != "rgb_array":
             return None
         if self._renderer is None:
@@ -52,8 +55,14 @@ class SingleEnv(gym.Env):
     def _show(self) -> None:
         if self.render_mode == "human":
             if self._viewer is None:
-                self._viewer = Viewer(self.envs)
+                from hippo.envs.viewer import Viewer  # loads GLFW
+
+                self._viewer = Viewer(self.envs, self.metadata["render_fps"])
             self._viewer.show(0)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What is pickled and copied: all but what draws, which the copy makes for itself."""
+        return vars(self) | {"_renderer": None, "_viewer": None}
 
     def close(self) -> None:
         """Release the simulation and what renders it."""

@@ -5,14 +5,15 @@ arrays they are given. numpy needs a hundred calls for it, each of them slow whi
 cosines and matrix products are left to numpy, so that results have the bits that they had before there were kernels.
 """
 
-from collections.abc import Sequence
 from typing import Any
 
 import gymnasium as gym
 import mujoco
 import numba
 import numpy as np
+from gymnasium.vector import AutoresetMode
 
+from hippo.envs.arguments import natural, real, reset_ids, seeds
 from hippo.envs.mass_centre import MassCentre
 from hippo.envs.perturb import perturb
 from hippo.envs.physics import BatchPhysics
@@ -84,14 +85,17 @@ def _fill(
 
 
 class RobotTaskEnv(gym.vector.VectorEnv):
-    """A vector environment with same-step autoreset.
+    """A vector environment in one of Gymnasium's three modes of autoreset.
 
-    When an episode ends in a step, the observation returned is the next episode's first, and the last one of the ended
-    episode is in `info["final_obs"]` (rows where `info["_final_obs"]`). `terminated` is the task's end, `truncated` the
-    horizon or a diverged simulation (`info["diverged"]`: reward 0, `final_obs` its last finite observation). The
-    reward's terms are in `info` under their names.
+    SAME_STEP: when an episode ends in a step, the observation returned is the next episode's first, and the last one of
+    the ended episode is in `info["final_obs"]` (rows where `info["_final_obs"]`). NEXT_STEP: the step returns the last
+    one, and the next step begins the next episode, whatever the action, for no reward. DISABLED: the caller begins it,
+    with `reset(options={"reset_mask": ended})`.
 
-    Without `autoreset` an environment whose episode ended stays as it is until `reset`, and `info` has no final_*.
+    `terminated` is the task's end, `truncated` the horizon or a diverged simulation (`info["diverged"]`: reward 0, its
+    last observation the last finite one). The reward's terms are in `info` under their names.
+
+    It can be pickled and copied; the copy continues bit-identically.
 
     Environment i draws from its own generator, seeded with `seed + i`, so it does not depend on its neighbours.
     """
@@ -106,9 +110,10 @@ class RobotTaskEnv(gym.vector.VectorEnv):
         horizon: int,
         revision: int,
         num_threads: int = 1,
-        autoreset: bool = True,
+        autoreset: AutoresetMode = AutoresetMode.SAME_STEP,
     ) -> None:
         self.num_envs, self.horizon, self.revision, self.options = num_envs, horizon, revision, options
+        self.num_threads, self.autoreset = num_threads, autoreset
         self.robot, self.task = robot, task_class(robot, options, num_envs)
         spec = robot.spec(options.physics)
         self.task.build(spec)
@@ -116,9 +121,8 @@ class RobotTaskEnv(gym.vector.VectorEnv):
             perturb(spec, robot.name, options.perturbation, options.strength)
         model = spec.compile()
         timing, centre = robot.timing(options.physics), None
-        mode = gym.vector.AutoresetMode.SAME_STEP if autoreset else gym.vector.AutoresetMode.DISABLED
         fps = round(1 / (timing.timestep * timing.frame_skip))
-        self.metadata = {"render_modes": list(RENDER_MODES), "render_fps": fps, "autoreset_mode": mode}
+        self.metadata = {"render_modes": list(RENDER_MODES), "render_fps": fps, "autoreset_mode": autoreset}
         slow = timing.integrator == mujoco.mjtIntegrator.mjINT_RK4 and not model.nsensor
         if robot.com_features is not None and slow and not self.task.pays_for_speed:
             centre = MassCentre(model, robot.com_features, is_free=model.jnt_type[0] == mujoco.mjtJoint.mjJNT_FREE)
@@ -149,10 +153,10 @@ class RobotTaskEnv(gym.vector.VectorEnv):
         self._qpos = model.key_qpos[0].copy() if model.nkey else model.qpos0.copy()
         self._clock = np.zeros(num_envs, np.int64)
         self._obs = np.zeros((num_envs, len(entries)), np.float32)
-        self.autoreset = autoreset
-        self._layout_seed: int | None = None
+        self._layout_seeds: list[int | None] = [None] * num_envs
         self._started = False
-        self._seed(seed)
+        self._waiting = np.zeros(0, np.int64)  # environments whose next episode begins with the next step: NEXT_STEP
+        self._rngs = [np.random.Generator(np.random.PCG64(s)) for s in seeds(seed, num_envs)]
 
     @property
     def robot_name(self) -> str:
@@ -169,58 +173,55 @@ class RobotTaskEnv(gym.vector.VectorEnv):
         """(N, 3) m, whole-robot centres of mass now; after a step, `info["com"]` has those before any autoreset."""
         return self.physics.com
 
-    def _seed(self, seed: int | Sequence[int | None]) -> None:
-        if isinstance(seed, Sequence):
-            seeds = [_natural("seed", s, may_be_none=True) for s in seed]
-        else:
-            first = _natural("seed", seed)
-            assert first is not None
-            seeds = [first + i for i in range(self.num_envs)]
-        if len(seeds) != self.num_envs:
-            raise ValueError(f"seed={seed}: give one integer or {self.num_envs} of them")
-        rngs = getattr(self, "_rngs", [None] * self.num_envs)
-        self._rngs = [
-            old if s is None and old is not None else np.random.Generator(np.random.PCG64(s))
-            for s, old in zip(seeds, rngs, strict=True)
-        ]
-
-    def reset(
-        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Start a new episode everywhere.
+    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
+        """Start new episodes, everywhere unless a mask says where.
 
         Args:
-            seed: restarts the generators; None goes on with them.
+            seed: restarts the generators: environment i's with `seed + i`, or with item i of `seed` (N,) unless that is
+                None. None goes on with them.
             options: `layout_seed`, an integer that fixes object positions or wall heights of this and all later
-                episodes in every environment (the pose stays random), or None to make them random again.
+                episodes of the environments reset (the pose stays random), or None to make them random again;
+                `reset_mask` (N,) of bools, the environments to reset, the others stay as they are.
         """
-        self._check_open()
-        unknown = set(options or {}) - {"layout_seed"}
+        self.check_open()
+        options = options or {}
+        unknown = set(options) - {"layout_seed", "reset_mask"}
         if unknown:
-            raise ValueError(f"reset option {sorted(unknown)[0]}: the only one is layout_seed")
-        if options is not None and "layout_seed" in options:
-            self._layout_seed = _natural("layout_seed", options["layout_seed"], may_be_none=True)
-        if seed is not None:
-            self._seed(seed)
+            raise ValueError(f"reset option {sorted(unknown)[0]}: must be layout_seed or reset_mask")
+        new_seeds = [None] * self.num_envs if seed is None else seeds(seed, self.num_envs)
+        layout_seed = natural("layout_seed", options.get("layout_seed"), may_be_none=True)
+        ids = np.arange(self.num_envs)
+        if options.get("reset_mask") is not None:
+            ids = reset_ids(options["reset_mask"], self.num_envs)
+        if not (self._started or len(ids) == self.num_envs):
+            raise gym.error.ResetNeeded("reset_mask before the first reset: call reset() without it first")
+        for i in ids:
+            if "layout_seed" in options:
+                self._layout_seeds[i] = layout_seed
+            if new_seeds[i] is not None:
+                self._rngs[i] = np.random.Generator(np.random.PCG64(new_seeds[i]))
         self._started = True
-        self._new_episodes(np.arange(self.num_envs))
-        self._obs = self._observe()
+        self._waiting = np.setdiff1d(self._waiting, ids)
+        self._new_episodes(ids)
+        self._obs[ids] = self._observe()[ids]
         return self._obs.copy(), {"diverged": np.zeros(self.num_envs, bool)}
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """One control step of every environment; actions (N, A) are clipped to [-1, 1] and mapped to the controls."""
-        self._check_open()
+        self.check_open()
         if not self._started:
             raise gym.error.ResetNeeded("step() before reset(): call reset() first")
-        # One type and layout, whatever the caller's, since numba compiles for each.
-        actions = np.array(actions, np.float64, order="C")
+        actions = real(actions)
         if actions.shape != self.action_space.shape:
             raise ValueError(f"actions have shape {actions.shape}; expected {self.action_space.shape}")
         wrong = _control(actions, self._middle, self._half, self.physics.ctrl)
         if wrong:
             raise ValueError(f"actions hold {wrong} non-finite numbers")
-        com_before = self.com.copy()
+        com_before, beginning = self.com.copy(), self._waiting
         self.physics.step()
+        if len(beginning):  # they were stepped without being asked; the task must not read where that led
+            self.physics.reset(beginning, self._qpos, np.zeros_like(self.physics.qvel[beginning]))
+            self.physics.forward(beginning)
 
         diverged, truncated = np.empty(self.num_envs, bool), np.empty(self.num_envs, bool)
         any_diverged = self.physics.diverged(diverged)
@@ -232,9 +233,17 @@ class RobotTaskEnv(gym.vector.VectorEnv):
             reward, terminated = np.where(diverged, 0.0, reward), terminated & ~diverged
             info = {name: np.where(diverged, 0.0, term) for name, term in info.items()}
             com[diverged], obs[diverged] = com_before[diverged], self._obs[diverged]
+        if len(beginning):
+            self._new_episodes(beginning)
+            self._clock[beginning] = -1  # the step of the reset is none of the episode
+            com[beginning], obs[beginning] = self.com[beginning], self._observe()[beginning]
+            for array in (reward, terminated, *info.values()):
+                array[beginning] = 0
         any_ended = _truncate(self._clock, self.horizon, terminated, diverged, truncated)
         info |= {"diverged": diverged, "com": com}
-        if any_ended and self.autoreset:
+        if self.autoreset is AutoresetMode.NEXT_STEP:
+            self._waiting = np.flatnonzero(terminated | truncated)
+        elif any_ended and self.autoreset is AutoresetMode.SAME_STEP:
             done = terminated | truncated
             info |= {
                 "final_obs": obs.copy(),
@@ -259,8 +268,8 @@ class RobotTaskEnv(gym.vector.VectorEnv):
 
     def _new_episodes(self, ids: np.ndarray) -> None:
         self._pose(ids)
-        fixed = self._layout_seed
-        self.task.reset(ids, [self._rngs[i] if fixed is None else np.random.default_rng(fixed) for i in ids])
+        fixed = self._layout_seeds
+        self.task.reset(ids, [self._rngs[i] if fixed[i] is None else np.random.default_rng(fixed[i]) for i in ids])
         self._clock[ids] = 0
 
     def _observe(self) -> np.ndarray:
@@ -284,13 +293,17 @@ class RobotTaskEnv(gym.vector.VectorEnv):
             "clock": self._clock.copy(),
             "obs": self._obs.copy(),
             "rngs": rngs,
-            "layout_seed": -1 if self._layout_seed is None else self._layout_seed,
+            "layout_seeds": [-1 if seed is None else seed for seed in self._layout_seeds],
             "started": int(self._started),
+            "waiting": self._waiting.copy(),
         }
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Continue from what `get_state` returned, here or in another process."""
-        self._check_open()
+        self.check_open()
+        self._restore(state)
+
+    def _restore(self, state: dict[str, Any]) -> None:
         for name, array in self.task.state.items():
             array[:] = state["task"][name]
         self._clock[:], self._obs = state["clock"], np.array(state["obs"])
@@ -302,19 +315,23 @@ class RobotTaskEnv(gym.vector.VectorEnv):
                 "has_uint32": has_uint32,
                 "uinteger": uinteger,
             }
-        self._layout_seed = None if state["layout_seed"] < 0 else int(state["layout_seed"])
-        self._started = bool(state["started"])
+        self._layout_seeds = [None if seed < 0 else int(seed) for seed in state["layout_seeds"]]
+        self._started, self._waiting = bool(state["started"]), np.array(state["waiting"])
         self.physics.set_state(state["physics"])
 
-    def _check_open(self) -> None:
+    def __reduce__(self) -> tuple:
+        """How it is pickled and copied: built anew, then given its state."""
+        first = (self.robot, type(self.task), self.options, self.num_envs, 0)
+        arguments = (*first, self.horizon, self.revision, self.num_threads, self.autoreset)
+        attributes = {name: value for name, value in vars(self).items() if name not in ("physics", "task")}
+        return type(self), arguments, (attributes, self.get_state())
+
+    def __setstate__(self, state: tuple[dict[str, Any], dict[str, Any]]) -> None:
+        attributes, simulation = state
+        vars(self).update(attributes)
+        self._restore(simulation)
+
+    def check_open(self) -> None:
+        """Raise ClosedEnvironmentError after `close`."""
         if self.closed:
             raise gym.error.ClosedEnvironmentError("this environment is closed")
-
-
-def _natural(name: str, value: Any, may_be_none: bool = False) -> int | None:
-    """`value` if it is an integer of at least 0 (or None where that is allowed); a ValueError that names it if not."""
-    if value is None and may_be_none:
-        return None
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 0:
-        raise ValueError(f"{name}={value}: must be an integer of at least 0{' or None' if may_be_none else ''}")
-    return int(value)
