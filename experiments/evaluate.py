@@ -18,8 +18,10 @@ import numpy as np
 import torch
 from scipy import stats
 
+from experiments import crossings
 from experiments.command_line import Parser, bad_input, run_command
 from experiments.config import Run, algorithm
+from experiments.crossings import Crossings, has_walls
 from experiments.status import read_status, write_atomically
 from hippo.core import seeding
 from hippo.core.checkpoint import Checkpoint, CheckpointError
@@ -84,7 +86,7 @@ def environments(run: Run, num_envs: int, seed: int, **changes: Any) -> RobotTas
 
 
 def evaluate(run: Run, episodes: int, seed: int, greedy: bool = False, **changes: Any) -> list[dict[str, Any]]:
-    """One row of COLUMNS per episode of the policy in `run`'s folder.
+    """One row of COLUMNS, on Block tasks of crossings.COLUMNS too, per episode of the policy in `run`'s folder.
 
     Args:
         episodes: how many, all simulated side by side. seed: of the evaluation, apart from the run's.
@@ -93,7 +95,9 @@ def evaluate(run: Run, episodes: int, seed: int, greedy: bool = False, **changes
     Raises:
         ConfigError: there is nothing trained, or no such option.
     """
-    envs = environments(run, episodes, seed, **changes)
+    envs: Any = environments(run, episodes, seed, **changes)
+    if has_walls(envs):
+        envs = Crossings(envs)
     streams = seeding.integer(seed, "evaluation of a policy")
     steps = algorithm(run.algo).rollout(run.restored_config, envs, streams, Checkpoint(run.folder), greedy)
     returns, lengths = opening_episodes(steps.reward.numpy(), steps.done.numpy())
@@ -107,9 +111,10 @@ def evaluate(run: Run, episodes: int, seed: int, greedy: bool = False, **changes
         "seed": seed,
         "diverged": steps.diverged,
     }
+    walls = envs.rows() if isinstance(envs, Crossings) else [{}] * episodes
     return [
-        common | {"episode": i, "return": float(r), "length": int(n)}
-        for i, (r, n) in enumerate(zip(returns, lengths, strict=True))
+        common | {"episode": i, "return": float(r), "length": int(n)} | crossed
+        for i, (r, n, crossed) in enumerate(zip(returns, lengths, walls, strict=True))
     ]
 
 
@@ -127,7 +132,8 @@ def evaluate_all(
 def as_csv(rows: Sequence[dict[str, Any]]) -> str:
     """Rows of `evaluate` as csv text."""
     text = io.StringIO()
-    writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
+    columns = COLUMNS + (crossings.COLUMNS if any("crossings" in row for row in rows) else ())
+    writer = csv.DictWriter(text, columns, lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
     return text.getvalue()
@@ -146,6 +152,8 @@ def summary(rows: Sequence[dict[str, Any]]) -> str:
         cells = f"{env:18} {perturbation:12} {'' if perturbation == 'none' else strength:8} {len(returns):8}"
         length = np.mean([row["length"] for row in episodes])
         lines.append(f"{cells}  {returns.mean():11.3f}  {between:>19}  {length:11.1f}")
+        if "crossings" in episodes[0]:
+            lines.append(crossings.summary(episodes))
     return "\n".join(lines)
 
 

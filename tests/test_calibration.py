@@ -1,0 +1,113 @@
+"""The ends of the Block tasks: crossings as they are, the search for a blind gait, and the gaits that were found."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+
+from experiments import calibration, crossings, gait_search
+from experiments.crossings import Crossings
+from hippo.envs import make
+
+CALIBRATION = gait_search.FOUND.parent.parent / "docs/environments/calibration.md"
+
+
+def put(envs, x, pitch):
+    """Leave the robots at rest at x (N,) and pitch (N,)."""
+    envs.physics.qpos[:, 0 if envs.robot_name == "half_cheetah" else 1] = x
+    envs.physics.qpos[:, 2], envs.physics.qvel[:] = pitch, 0.0
+    envs.physics.forward(np.arange(envs.num_envs))
+
+
+@pytest.mark.parametrize("task", gait_search.TASKS)
+def test_a_crossing_is_tumbled_by_the_torsos_angle_and_has_the_height_of_the_torso(task):
+    inner = make(task, 4, 0, horizon=2)
+    envs = Crossings(inner)
+    still = np.zeros(inner.action_space.shape)
+    for pitches in ([0.5, 1.5, -1.5, 0.0], [0.5, 1.5, 2 * np.pi - 0.5, 0.0]):
+        envs.reset(seed=0)
+        put(inner, [2.9, 2.9, 4.9, 0.0], pitches)  # one wall, one, two at once, none
+        envs.step(still)
+        heights = [inner.physics.data(i).body("torso").xpos[2] for i in range(4)]
+        put(inner, [4.9, 2.9, 4.9, 2.9], [2.0, 0.0, 0.0, 2.0])  # another, none, none, the first
+        envs.step(still)  # the end of the episodes: what follows counts for nothing
+        put(inner, np.full(4, 9.0), np.zeros(4))
+        envs.step(still)
+        rows = envs.rows()
+        assert [row["crossings"] for row in rows] == [2, 1, 2, 1]
+        assert [row["crossings_tumbled"] for row in rows] == [1, 1, 2 if pitches[2] == -1.5 else 0, 1]
+        np.testing.assert_allclose([rows[i]["crossings_height"] for i in (1, 2)], heights[1:3], atol=1e-6)
+
+
+def test_no_crossing_has_no_height_and_the_summary_weighs_every_wall_alike():
+    rows = [dict(zip(crossings.COLUMNS, values, strict=True)) for values in ((0, 0, None), (1, 1, 0.4), (3, 0, 0.8))]
+    assert crossings.summary(rows) == "4 walls cleared, 25% of them with |pitch| > 1 rad, torso at 0.70 m"
+    assert crossings.summary(rows[:1]) == "no wall was cleared"
+
+
+def test_a_gait_is_one_sinusoid_per_joint_of_a_common_frequency():
+    gait = gait_search.Gait(frequency=2.0, amplitude=(1.0, 0.5), phase=(0.0, np.pi / 2), offset=(0.1, -0.2))
+    parameters = gait_search.row(gait)[None]
+    assert gait_search.gait(parameters[0]) == gait
+    # A quarter of a period of 0.5 s later the sine is at its top and the cosine at nothing.
+    np.testing.assert_allclose(gait_search.actions(parameters, 0.125), [[1.1, -0.2]], atol=1e-15)
+
+
+def test_the_search_finds_the_best_parameters_and_repeats_itself(monkeypatch):
+    target = np.array([1.5, 0.3, 0.7, 0.2, 1.0, -1.0, 0.5, 0.1, -0.1, 0.0])
+    monkeypatch.setattr(gait_search, "scores", lambda task, p, *arguments: -((p - target) ** 2).sum(1))
+    found = [gait_search.search("block_hopper", 4_000_000, seed=0, report=lambda _: None) for _ in range(2)]
+    np.testing.assert_allclose(gait_search.row(found[0]), target, atol=0.1)
+    assert found[0] == found[1]
+
+
+def test_a_score_is_walls_and_the_way_in_walls_of_fresh_episodes(monkeypatch):
+    standing = np.zeros((2, 10))
+    score = gait_search.scores("block_hopper", standing, 3, seed=0, horizon=2)
+    assert score.shape == (2,)
+    assert (np.abs(score) < 0.05).all()
+    assert score[0] != score[1]
+
+
+@pytest.mark.parametrize("task", gait_search.TASKS)
+def test_the_committed_gait_clears_walls_without_seeing_them_as_the_page_says(task):
+    rows = calibration.measure(task, calibration.blind_gait(task), episodes=4, seed=1)
+    written = re.search(rf"\| `{task}` \| blind gait \| ([0-9.]+) ", CALIBRATION.read_text())
+    assert np.mean([row["crossings"] for row in rows]) > float(written[1]) / 2
+
+
+def test_the_command_prints_a_row_per_task_and_policy(monkeypatch, capsys):
+    monkeypatch.setattr(calibration, "make", lambda *a, **k: make(*a, **k | {"horizon": 3}))
+    assert calibration.main(["--episodes", "2", "--tumble"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split(" | ")[1] for line in lines[2:]] == ["uniform actions", "Gaussian noise", "blind gait"] * 2
+
+
+@pytest.mark.parametrize(
+    ("main", "arguments", "message"),
+    [
+        (gait_search.main, ["block_hopper", "--steps", "10"], "--steps=10: must be at least one generation"),
+        (gait_search.main, ["block_hopper", "--seed", "-1"], "--seed=-1"),
+        (calibration.main, ["--episodes", "0"], "--episodes=0: must be at least 1"),
+        (calibration.main, ["--seed", "-1"], "--seed=-1"),
+    ],
+)
+def test_bad_input_is_refused_in_a_line(main, arguments, message, capsys):
+    assert main(arguments) == 2
+    captured = capsys.readouterr()
+    assert message in captured.err
+    assert captured.err.count("\n") == 1
+    assert not captured.out
+
+
+def test_a_search_renews_its_own_entry_only(tmp_path, monkeypatch):
+    out = tmp_path / "gaits.json"
+    out.write_text(json.dumps({"block_hopper": "kept"}))
+    gait = gait_search.Gait(1.0, (1.0,), (0.0,), (0.0,))
+    monkeypatch.setattr(gait_search, "search", lambda *arguments: gait)
+    assert gait_search.main(["block_half_cheetah", "--out", str(out)]) == 0
+    found = json.loads(out.read_text())
+    assert found["block_hopper"] == "kept"
+    monkeypatch.setattr(gait_search, "FOUND", out)
+    assert gait_search.committed("block_half_cheetah") == gait
