@@ -16,6 +16,8 @@ from typing import Any
 import yaml
 
 from analysis.edition import Edition
+from analysis.runs import code_of, read_plan, stretches
+from hippo.core.files import read_json
 
 STATED = re.compile(rb"(\d+) runs, set [0-9a-f]{12}: ((?:[0-9a-f]{12} ?)+)")
 
@@ -44,7 +46,7 @@ def run_ids(path: Path) -> list[str]:
 
 def plans(runs_dir: Path) -> list[dict[str, Any]]:
     """Every plan that was written in `runs_dir`."""
-    return [json.loads(path.read_text()) for path in sorted((runs_dir / "plans").rglob("*.json"))]
+    return [read_plan(path) for path in sorted((runs_dir / "plans").rglob("*.json"))]
 
 
 def describe_run(folder: Path) -> list[str]:
@@ -70,13 +72,15 @@ def describe_run(folder: Path) -> list[str]:
     if manifest.get("parent"):
         lines.append(f"needs: {folder.parent / manifest['parent']}")
     if (folder / "status.json").exists():
-        status = json.loads((folder / "status.json").read_text())
-        lines.append(f"{status['state']} at iteration {status['iteration'] + 1}  {status['message']}".rstrip())
+        status = read_json(folder / "status.json", {"state": str, "iteration": int, "message": str})
+        said = "".join(letter if letter.isprintable() else "?" for letter in status["state"] + "  " + status["message"])
+        state, _, message = said.partition("  ")
+        lines.append(f"{state} at iteration {status['iteration'] + 1}  {message}".rstrip())
     if (folder / "progress.csv").exists():
         rows = list(csv.DictReader((folder / "progress.csv").read_text().splitlines()))
         if rows and "return_mean" in rows[-1]:
             lines.append(f"return of the last iteration: {float(rows[-1]['return_mean']):.3f}")
-    lines.append(f"commit {manifest['git_commit']}{' and changes to it' if manifest['git_difference'] else ''}")
+    lines += [stretch_line(each) for each in stretches(manifest)]
     shown = [
         f"{plan['figure']} at {Edition.planned(plan)} as {of['variant']}"
         for plan in plans(folder.parent)
@@ -85,6 +89,16 @@ def describe_run(folder: Path) -> list[str]:
     ]
     lines.append(f"in {', '.join(shown)}" if shown else f"in no plan of {folder.parent}")
     return lines
+
+
+def stretch_line(stretch: dict[str, Any]) -> str:
+    """The code, the versions and the machine of one stretch of a run, as far as they are stated."""
+    versions = stretch.get("versions")
+    words = [f"Python {stretch['python']}"] if "python" in stretch else []
+    words += [f"{name} {version}" for name, version in versions.items()] if isinstance(versions, dict) else []
+    words += [str(stretch["cpu"])] if "cpu" in stretch else []
+    start = f"from iteration {stretch['from_iteration']}: " if stretch.get("from_iteration") else ""
+    return ", ".join([f"{start}commit {code_of(stretch)}", *words])
 
 
 def describe(ids: Sequence[str], runs_dir: Path) -> list[str]:
@@ -101,7 +115,7 @@ def describe(ids: Sequence[str], runs_dir: Path) -> list[str]:
             words += [scale, run["env"], run["variant"], f"seed {run['seed']}", run["state"]]
         manifest = runs_dir / run_id / "manifest.json"
         if manifest.exists():
-            words.append(f"commit {json.loads(manifest.read_text())['git_commit']}")
+            words.append(f"commit {', then '.join(map(code_of, stretches(read_json(manifest, {}))))}")
         else:
             words.append("no run folder here")
         lines.append("  ".join(words))
@@ -119,11 +133,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
             print("\n".join(describe_run(options.file)))
             return 0
         ids = run_ids(options.file)
-    except ValueError as error:
+        lines = describe(ids, options.runs_dir)
+    except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    print(f"{options.file}: {len(ids)} runs")
-    print("\n".join(describe(ids, options.runs_dir)))
+    print(f"{options.file}: {len(ids)} runs", *lines, sep="\n")
     return 0
 
 

@@ -116,7 +116,7 @@ def behind(artefact: Artefact) -> str:
 
 def run_row(run: RunFacts) -> list[str]:
     """One run under RUN_COLUMNS."""
-    commit = {None: UNKNOWN, True: f"{run.commit[:10]} + changes", False: run.commit[:10] or UNKNOWN}[run.dirty]
+    commit = ", then ".join(run.code)
     cost = UNKNOWN if run.seconds is None else f"{run.seconds:,.0f}"
     method = ", ".join(run.labels) or "others start from it"
     known = (run.run_id, run.algo, method, run.seed, run.state, commit, run.lock[:10], cost, run.physics)
@@ -136,7 +136,10 @@ def code_table(runs: Sequence[RunFacts]) -> Table:
     groups = Counter((run.commit, run.dirty, run.lock, run.cpu) for run in runs if run.dirty is not None)
     return Table(
         ["commit", "uncommitted changes", "lock file (SHA-256)", "processor", "runs"],
-        [[c or UNKNOWN, "yes" if d else "no", k[:16] or UNKNOWN, p, str(n)] for (c, d, k, p), n in groups.items()],
+        [
+            [c or UNKNOWN, "yes" if d else "no" if c else UNKNOWN, k[:16] or UNKNOWN, p, str(n)]
+            for (c, d, k, p), n in groups.items()
+        ],
     )
 
 

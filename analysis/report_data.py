@@ -14,7 +14,7 @@ from PIL import Image
 
 from analysis import explain
 from analysis.edition import OVERRIDDEN, Edition
-from analysis.runs import MissingData, check_edition
+from analysis.runs import MissingData, check_edition, code_of, stretches
 
 ROOT = Path(__file__).parent.parent
 LEDGER = ROOT / "docs" / "hyperparameters.csv"
@@ -53,6 +53,7 @@ class RunFacts:
     used_in: list[str] = field(default_factory=list)
     commit: str = ""
     dirty: bool | None = None  # None: no manifest here
+    code: list[str] = field(default_factory=list)  # `code_of` each stretch of a run that was interrupted
     lock: str = ""
     cpu: str = ""
     seconds: float | None = None  # core-seconds, a run has one thread; None: it has no clocks here
@@ -168,6 +169,8 @@ def read_plans(plans_dir: Path, edition: Edition) -> dict[str, dict[str, Any]]:
         if missing:
             raise ValueError(f"{path}: is no plan, it lacks {', '.join(sorted(missing))}")
         check_edition(path, plan, edition)
+        if plan["figure"] != path.stem:
+            raise ValueError(f"{path}: figure must be {path.stem}, is {plan['figure']!r:.60}")
         plans[path.stem] = plan
     return plans
 
@@ -178,6 +181,11 @@ def core_seconds(path: Path) -> float | None:
         return None
     text = path.read_text()
     return sum(float(row["seconds"]) for row in csv.DictReader(text[: text.rfind("\n") + 1].splitlines()))
+
+
+def is_own(path: Path) -> bool:
+    """Whether a file lies in its folder itself: what a link leads to is not read."""
+    return path.is_file() and not path.is_symlink()
 
 
 def read_folder(facts: RunFacts, runs_dir: Path) -> None:
@@ -194,8 +202,9 @@ def read_folder(facts: RunFacts, runs_dir: Path) -> None:
         facts.env, facts.seed = facts.env or str(identity.get("env", "")), facts.seed or str(identity.get("seed", ""))
         facts.commit, facts.lock = str(content.get("git_commit") or ""), str(content.get("lock") or "")
         facts.dirty, facts.cpu = bool(content.get("git_difference")), str(content.get("cpu") or "")
+        facts.code = list(dict.fromkeys(map(code_of, stretches(content))))
     facts.seconds = core_seconds(folder / "timing.csv")
-    facts.videos = sorted(path for path in folder.iterdir() if path.suffix in VIDEOS)
+    facts.videos = sorted(path for path in folder.iterdir() if path.suffix in VIDEOS and is_own(path))
 
 
 def read_runs(plans: dict[str, dict[str, Any]], runs_dir: Path) -> list[RunFacts]:

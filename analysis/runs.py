@@ -4,18 +4,32 @@ What belongs to a figure stands in its plan, `<runs_dir>/plans/<scale>/<figure>.
 edition.py says where those of another protocol, and of figures with overrides, lie.
 """
 
+import functools
 import hashlib
 import io
-import json
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from analysis.edition import PAPER, Edition
+from hippo.core.files import DamagedFile, check_object, read_json
+from hippo.core.results import damage
 
+NAME, LABEL = re.compile(r"\w[\w.-]*"), re.compile(r"[^\x00-\x1f\x7f-\x9f]*")
+COLUMN = re.compile(r"\w[\w.:/-]*")  # of progress.csv; nothing that a spreadsheet takes for a formula
+# What names in a plan may be: they become names of files, cells of tables and lines on a terminal.
+PATTERNS = {"run_id": re.compile("[0-9a-f]{12}"), "env": NAME, "variant": NAME, "kind": NAME, "physics": NAME}
+PATTERNS |= dict.fromkeys(("env_label", "variant_label", "state"), LABEL)
+PLAN: dict[str, type | tuple[type, ...]] = {"figure": str, "scale": str, "title": str, "runs": list}
+PLANNED: dict[str, type | tuple[type, ...]] = {
+    **dict.fromkeys(("run_id", "env", "env_label", "variant", "variant_label", "physics", "kind", "state"), str),
+    **dict.fromkeys(("seed", "iterations", "batch_size"), int),
+}
 COLUMNS = ["figure", "scale", "env", "variant", "seed", "run_id", "env_steps", "metric", "value"]
 
 
@@ -34,7 +48,7 @@ class Results:
     plan: dict[str, Any]
     frame: pd.DataFrame  # COLUMNS
     missing: list[dict[str, Any]]  # planned runs without a single row, or cut short, as they stand in the plan
-    commits: list[str] = field(default_factory=list)  # at which the runs whose folders are here were trained
+    commits: list[str] = field(default_factory=list)  # `code_of` the runs whose folders are here
 
     @property
     def edition(self) -> Edition:
@@ -49,7 +63,7 @@ class Results:
         """The runs behind the data and the commits they were trained at, as one line."""
         ids = sorted(set(self.frame["run_id"]))
         digest = hashlib.sha256(" ".join(ids).encode()).hexdigest()[:12]
-        commits = " ".join(commit[:10] or "unknown" for commit in self.commits) or "those of the committed results"
+        commits = ", ".join(self.commits) or "those of the committed results"
         return f"{len(ids)} runs, set {digest}: {' '.join(ids)}; commits: {commits}"
 
     def origin(self) -> str:
@@ -61,6 +75,12 @@ class Results:
             f"{len(rows):,} rows of {rows['run_id'].nunique()} runs {where}" if len(rows) else f"nothing {where}"
             for where, rows in parts.items()
         )
+
+    @functools.cached_property
+    def seeds_with_return(self) -> dict[tuple[str, str], int]:
+        """Number of seeds that have a learning curve, by environment and method."""
+        rows = self.frame[self.frame["metric"] == "return_mean"]
+        return {(str(e), str(v)): int(n) for (e, v), n in rows.groupby(["env", "variant"])["seed"].nunique().items()}
 
     def missing_lines(self) -> list[str]:
         """`missing` in words: a line per environment, and per seeds and state where these differ."""
@@ -108,7 +128,7 @@ def load(
         write = f"python -m experiments.sweep write {figure} {edition.options}"
         command = write if edition.overrides else f"make draw-{figure} {edition.variables}"
         raise MissingData(f"{figure}: no plan at {edition} in {runs_dir}; run `{command}`")
-    plan = json.loads(path.read_text())
+    plan = read_plan(path)
     check_edition(path, plan, edition)
     if not plan["runs"]:
         raise NotAtThisScale(f"{figure}: not trained at {edition}, only at {', '.join(plan['scales'])}")
@@ -127,6 +147,8 @@ def load(
             rows = read_episodes(runs_dir / run["run_id"] / "episodes.csv")
         else:
             rows = read_progress(runs_dir / run["run_id"] / "progress.csv", metrics)
+        if run["state"] != "committed" and (wrong := altered(runs_dir / run["run_id"])):
+            rows, run = rows[:0], run | {"state": wrong}
         # Only whole runs are ever committed, and perhaps thinned.
         expected = run["iterations"] if run["kind"] == "train" and run["state"] != "committed" else 1
         if rows.empty or rows.groupby("metric").size().min() < expected:
@@ -144,6 +166,34 @@ def load(
     return Results(plan, frame, missing, read_commits(runs_dir, sorted(set(frame["run_id"]))))
 
 
+def read_plan(path: Path) -> dict[str, Any]:
+    """A plan as experiments.sweep wrote it.
+
+    Raises:
+        DamagedFile: it is none; names the file and what is wrong.
+    """
+    plan = read_json(path, PLAN)
+    if plan["figure"] != path.stem:  # its name is that of the files that are drawn
+        raise DamagedFile(f"{path}: figure must be {path.stem}, is {plan['figure']!r:.60}")
+    if not plan["title"].isprintable():
+        raise DamagedFile(f"{path}: title must be one line of text")
+    for i, run in enumerate(plan["runs"]):
+        check_object(path, run, PLANNED, f"runs[{i}]: ")
+        for key, pattern in PATTERNS.items():
+            if not pattern.fullmatch(run[key]):
+                raise DamagedFile(f"{path}: runs[{i}]: {key} {run[key]!r:.60} must match {pattern.pattern}")
+    return plan
+
+
+def altered(folder: Path) -> str:
+    """How the results of a finished run differ from what it wrote, in words; "" where they do not."""
+    try:
+        status = read_json(folder / "status.json", {"state": str, "results": dict, "iterations": int})
+    except (OSError, DamagedFile):  # never finished, or by older code
+        return ""
+    return damage(folder, status["iterations"], status["results"]) if status["state"] == "finished" else ""
+
+
 def check_edition(path: Path, plan: dict[str, Any], edition: Edition) -> None:
     """Raise ValueError if the plan that was read from `path` says that it is of another edition."""
     if (other := Edition.planned(plan)) != edition:
@@ -151,21 +201,51 @@ def check_edition(path: Path, plan: dict[str, Any], edition: Edition) -> None:
 
 
 def read_commits(runs_dir: Path, ids: Sequence[str]) -> list[str]:
-    """The commits that the manifests of runs state, each once; runs without a folder here state none."""
+    """`code_of` every stretch of runs, each once; runs without a folder here state none."""
     manifests = [runs_dir / run_id / "manifest.json" for run_id in ids]
-    return sorted({json.loads(path.read_text())["git_commit"] or "" for path in manifests if path.exists()})
+    return sorted({code_of(part) for path in manifests if path.exists() for part in stretches(read_json(path, {}))})
+
+
+def stretches(manifest: dict[str, Any]) -> list[dict[str, Any]]:
+    """What a manifest says about each stretch of a run that was interrupted, the last one last."""
+    earlier = manifest.get("earlier", [{"git_commit": commit} for commit in manifest.get("earlier_commits", [])])
+    return [*(each for each in earlier if isinstance(each, dict)), manifest]
+
+
+def code_of(stretch: dict[str, Any]) -> str:
+    """The code of a stretch in words: a commit, perhaps with changes; what is not known is never clean."""
+    commit, difference = str(stretch.get("git_commit")), stretch.get("git_difference", "unknown")
+    if not re.fullmatch("[0-9a-f]{6,64}", commit):
+        return "unknown"
+    commit = commit[:10]
+    if difference is None:
+        return commit
+    return f"{commit} + {'perhaps ' if difference == 'unknown' else ''}changes"
 
 
 def read_progress(path: Path, metrics: Sequence[str] | None) -> pd.DataFrame:
-    """env_steps, metric, value of one run's progress.csv; a last line torn by a kill is left out."""
+    """env_steps, metric, value of one run's progress.csv; a last line torn by a kill is left out.
+
+    Raises:
+        DamagedFile: it is no progress.csv, or has something else than numbers in a column.
+    """
+    nothing = pd.DataFrame(columns=["env_steps", "metric", "value"])
     if not path.exists():
-        return pd.DataFrame(columns=["env_steps", "metric", "value"])
-    text = path.read_text()
-    whole = text[: text.rfind("\n") + 1]
+        return nothing
+    data = path.read_bytes()
+    whole = data[: data.rfind(b"\n") + 1]
     if not whole:
-        return pd.DataFrame(columns=["env_steps", "metric", "value"])
-    table = pd.read_csv(io.StringIO(whole))
-    columns = [c for c in table.columns if c not in ("iteration", "env_steps") and (metrics is None or c in metrics)]
+        return nothing
+    try:
+        names = whole[: whole.find(b"\n")].decode().strip().split(",")
+        columns = [c for c in names if c not in ("iteration", "env_steps") and (metrics is None or c in metrics)]
+        table = pd.read_csv(io.BytesIO(whole), usecols=["env_steps", *columns])
+    except (ValueError, KeyError) as error:  # pandas' parser errors are of this kind
+        raise DamagedFile(f"{path}: is no progress.csv ({' '.join(str(error).split())[:100]})") from None
+    if strange := [name for name in columns if not COLUMN.fullmatch(name)]:
+        raise DamagedFile(f"{path}: is no progress.csv (a column {strange[0]!r:.60})")
+    if words := [name for name in table if not pd.api.types.is_numeric_dtype(table[name])]:
+        raise DamagedFile(f"{path}: is no progress.csv ({', '.join(map(str, words))}: not only numbers)")
     return table.melt(id_vars="env_steps", value_vars=columns, var_name="metric")
 
 
@@ -173,9 +253,13 @@ def read_episodes(path: Path) -> pd.DataFrame:
     """env_steps (here the episode's number), metric "return:<perturbation>:<strength>", value of one evaluation."""
     if not path.exists():
         return pd.DataFrame(columns=["env_steps", "metric", "value"])
-    table = pd.read_csv(path, keep_default_na=False)
-    metric = "return:" + table["perturbation"] + ":" + table["strength"]
-    return pd.DataFrame({"env_steps": table["episode"], "metric": metric, "value": table["return"]})
+    try:
+        table = pd.read_csv(path, keep_default_na=False)
+        metric = "return:" + table["perturbation"] + ":" + table["strength"]
+        parts = {"env_steps": table["episode"], "metric": metric, "value": table["return"].astype(float)}
+    except (ValueError, KeyError, TypeError) as error:
+        raise DamagedFile(f"{path}: is no episodes.csv ({' '.join(str(error).split())[:100]})") from None
+    return pd.DataFrame(parts)
 
 
 def read_committed(path: Path, scale: str) -> pd.DataFrame:
@@ -200,5 +284,6 @@ def scores(
 ) -> tuple[list[Any], list[Any], pd.DataFrame]:
     """One curve bundle: its seeds, its environment steps and a (steps x seeds) table, NaN where a run stopped."""
     chosen = frame[(frame["env"] == env) & (frame["variant"] == variant) & (frame["metric"] == metric)]
+    chosen = chosen.assign(value=chosen["value"].where(np.isfinite(chosen["value"])))
     table = chosen.pivot_table(index="env_steps", columns="seed", values="value", dropna=False).sort_index()
     return list(table.columns), list(table.index), table

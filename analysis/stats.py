@@ -11,6 +11,7 @@ from scipy import stats
 
 RESAMPLES = 2000
 LEVEL = 0.95
+AT_ONCE = 4_000_000  # numbers that a bootstrap holds
 SEED = 0  # of the resampling, so that a figure drawn twice is the same
 
 
@@ -47,6 +48,17 @@ def bootstrap_mean(scores: np.ndarray, resamples: int = RESAMPLES) -> Interval:
     if len(scores) < 2:
         nothing = np.full(point.shape, np.nan)
         return Interval(point, nothing, nothing)
+    columns = scores.reshape(len(scores), -1)
+    width = max(1, AT_ONCE // (len(scores) * resamples))
+    parts = [
+        _bootstrap(columns[:, first : first + width], resamples) for first in range(0, max(1, columns.shape[1]), width)
+    ]
+    low, high = (np.concatenate(ends).reshape(point.shape) for ends in zip(*parts, strict=True))
+    return Interval(point, low, high)
+
+
+def _bootstrap(scores: np.ndarray, resamples: int) -> tuple[np.ndarray, np.ndarray]:
+    """Both ends of the interval of a few columns; every column is resampled with the same draws."""
     result = stats.bootstrap(
         (scores,),
         np.mean,
@@ -57,7 +69,7 @@ def bootstrap_mean(scores: np.ndarray, resamples: int = RESAMPLES) -> Interval:
         method="percentile",
         rng=np.random.default_rng(SEED),
     )
-    return Interval(point, result.confidence_interval.low, result.confidence_interval.high)
+    return result.confidence_interval.low, result.confidence_interval.high
 
 
 def stratified_bootstrap_iqm(scores: np.ndarray, resamples: int = RESAMPLES) -> Interval:

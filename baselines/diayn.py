@@ -26,7 +26,7 @@ from hippo.core.normalize import Standardizer
 from hippo.core.policies import SkillPolicy
 from hippo.core.ppo import in_chunks
 from hippo.core.pretraining import Paths, PretrainingConfig, train_skills, trained_skills
-from hippo.core.settings import setting
+from hippo.core.settings import WIDEST, setting
 
 __all__ = ["DIAYNConfig", "skills", "train"]
 
@@ -53,6 +53,7 @@ class DIAYNConfig(PretrainingConfig):
         code="300, 300 (mujoco_all_diayn.py:30)",
         ours="six skills need less; a third of the time of an iteration otherwise",
         low=1,
+        high=WIDEST,
     )
     discriminator_learning_rate: float = setting(
         1e-3,

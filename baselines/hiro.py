@@ -30,7 +30,7 @@ from hippo.core.goals import BODY_GOALS, Goals, Memory, candidate_goals
 from hippo.core.log import RunLog, check_finite
 from hippo.core.replay import Replay
 from hippo.core.rollout import LastInfo, Steps
-from hippo.core.settings import ConfigError, check, setting
+from hippo.core.settings import MOST_STEPS, WIDEST, ConfigError, check, setting
 from hippo.core.skills import load_skills, policy_of
 from hippo.core.td3 import TD3
 
@@ -50,7 +50,11 @@ class HiroConfig:
 
     iterations: int = setting(dataclasses.MISSING, "training iterations", ours="HIRO's own 10 M steps", low=1)
     batch_size: int = setting(
-        dataclasses.MISSING, "environment steps per iteration", ours="one horizon of a few environments", low=1
+        dataclasses.MISSING,
+        "environment steps per iteration",
+        ours="one horizon of a few environments",
+        low=1,
+        high=MOST_STEPS,
     )
     horizon: int = setting(
         dataclasses.MISSING, "episode length H in steps", paper="Block 1000, Ant 5000, Snake 8000 (App. A)", low=1
@@ -67,7 +71,7 @@ class HiroConfig:
         10.0, "half range of goals in x and y, m", code="10 (hiro_xy.gin:6); the arena's is 6", above=0.0
     )
     hidden_sizes: list[int] = setting(
-        [300, 300], "two hidden layers (ReLU) of all networks", code="300, 300 (base_uvf.gin:34)", low=1
+        [300, 300], "two hidden layers (ReLU) of all networks", code="300, 300 (base_uvf.gin:34)", low=1, high=WIDEST
     )
     actor_learning_rate: float = setting(1e-4, "Adam step size of the actors", code="1e-4", above=0.0)
     critic_learning_rate: float = setting(1e-3, "Adam step size of the critics", code="1e-3", above=0.0)
@@ -79,7 +83,9 @@ class HiroConfig:
     )
     delay: int = setting(2, "critic updates per update of actor and targets", code="2 (train_uvf.gin:27)", low=1)
     minibatch_size: int = setting(100, "transitions per update", code="100 (train_uvf.gin:22)", low=1)
-    replay_size: int = setting(200_000, "rows of each level's replay buffer", code="200,000 (train_uvf.gin:3)", low=1)
+    replay_size: int = setting(
+        200_000, "rows of each level's replay buffer", code="200,000 (train_uvf.gin:3)", low=1, high=MOST_STEPS
+    )
     warmup_steps: int = setting(
         2500, "environment steps before the first update", code="5 episodes of 500 (train_uvf.gin:21)", low=0
     )

@@ -26,7 +26,7 @@ from hippo.core.options import Execution, OptionPolicy, Options
 from hippo.core.policies import POLICY_HEAD, gaussian_entropy
 from hippo.core.ppo import Level, Rows, clipped_surrogate, in_chunks, surrogate_statistics
 from hippo.core.rollout import Steps
-from hippo.core.settings import ConfigError, check, setting
+from hippo.core.settings import MOST_SKILLS, MOST_STEPS, WIDEST, ConfigError, check, setting
 from hippo.core.skills import start_from
 from hippo.core.value import explained_variance
 
@@ -47,12 +47,16 @@ class OptionCriticConfig:
 
     iterations: int = setting(dataclasses.MISSING, "training iterations", code="488 of 2048 steps", low=1)
     batch_size: int = setting(
-        dataclasses.MISSING, "environment steps per iteration", paper="Block 50 000, Gather 100 000 (App. A)", low=1
+        dataclasses.MISSING,
+        "environment steps per iteration",
+        paper="Block 50 000, Gather 100 000 (App. A)",
+        low=1,
+        high=MOST_STEPS,
     )
     horizon: int = setting(
         dataclasses.MISSING, "episode length H in steps", paper="Block 1000, Ant 5000, Snake 8000 (App. A)", low=1
     )
-    num_skills: int = setting(6, "number of options", paper="6 skills (App. A)", code="2", low=1)
+    num_skills: int = setting(6, "number of options", paper="6 skills (App. A)", code="2", low=1, high=MOST_SKILLS)
     ppoc_faithful: bool = setting(
         False,
         "the losses and the one Adam of PPOC's code instead of the option-critic's gradients",
@@ -103,7 +107,12 @@ class OptionCriticConfig:
     gamma: float = setting(0.99, "discount per environment step", code="0.99 (run_mujoco.py)", above=0.0, high=1.0)
     gae_lambda: float = setting(0.95, "GAE lambda", code="0.95 (run_mujoco.py)", low=0.0, high=1.0)
     skill_hidden_sizes: list[int] = setting(
-        [64, 64], "hidden layers of the intra-option policies", paper="2 x 64 (App. A)", code="2 x 64", low=1
+        [64, 64],
+        "hidden layers of the intra-option policies",
+        paper="2 x 64 (App. A)",
+        code="2 x 64",
+        low=1,
+        high=WIDEST,
     )
     skill_integration: str = setting(
         "bilinear",
@@ -138,12 +147,17 @@ class OptionCriticConfig:
         paper="from scratch; given skills in Fig. 6",
     )
     manager_hidden_sizes: list[int] = setting(
-        [32, 32], "hidden layers of the policy over options", paper="2 x 32 (manager, App. A)", low=1
+        [32, 32], "hidden layers of the policy over options", paper="2 x 32 (manager, App. A)", low=1, high=WIDEST
     )
     termination_hidden_sizes: list[int] = setting(
-        [32, 32], "hidden layers of the terminations", code="a head on the critic's 2 x 64", ours="a manager's", low=1
+        [32, 32],
+        "hidden layers of the terminations",
+        code="a head on the critic's 2 x 64",
+        ours="a manager's",
+        low=1,
+        high=WIDEST,
     )
-    critic_hidden_sizes: list[int] = setting([64, 64], "hidden layers of the critic", code="2 x 64", low=1)
+    critic_hidden_sizes: list[int] = setting([64, 64], "hidden layers of the critic", code="2 x 64", low=1, high=WIDEST)
 
     def __post_init__(self) -> None:
         check(self)

@@ -24,7 +24,7 @@ from hippo.core.on_policy import SurrogateConfig, improve, make_optimizer
 from hippo.core.policies import GaussianPolicy, gaussian_entropy
 from hippo.core.ppo import Level, Rows
 from hippo.core.rollout import Steps
-from hippo.core.settings import ConfigError, setting
+from hippo.core.settings import WIDEST, ConfigError, setting
 from hippo.core.value import ValueFunction, explained_variance
 
 REVISION = 1  # bumped by every change that alters the metrics of tests/golden
@@ -48,7 +48,7 @@ class PPOConfig(SurrogateConfig):
         "whether gamma counts environment steps rather than held actions",
         code="held actions: gamma is not adjusted (action_repeating_env2.py:35)",
     )
-    hidden_sizes: list[int] = setting([256, 64], "policy's hidden layers", paper="256, 64 (App. A)", low=1)
+    hidden_sizes: list[int] = setting([256, 64], "policy's hidden layers", paper="256, 64 (App. A)", low=1, high=WIDEST)
 
     def __post_init__(self) -> None:
         super().__post_init__()

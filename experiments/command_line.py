@@ -1,12 +1,16 @@
 """What every command line here shares: exit codes, one-line errors and how times are written."""
 
 import argparse
+import errno
 import signal
 import sys
+import tempfile
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, NoReturn
 
 from experiments.console import discard
+from hippo.core.settings import ConfigError
 
 EXIT_FAILED, EXIT_BAD_INPUT, EXIT_DIVERGED, EXIT_NOT_AGREED = 1, 2, 3, 4
 EXIT_REQUEUE = 75  # sysexits' EX_TEMPFAIL
@@ -40,10 +44,26 @@ def run_command(main: Callable[[], int | None]) -> NoReturn:
     sys.exit(code)
 
 
+def check_writable(key: str, path: Path) -> None:
+    """Raise ConfigError unless a file can be written at `path`, before any work is done for it."""
+    try:
+        if path.is_dir():
+            raise IsADirectoryError(errno.EISDIR, "is a folder")
+        with tempfile.TemporaryFile(dir=path.parent):
+            pass
+    except OSError as error:
+        raise ConfigError(key, path, f"must be a file that can be written ({error.strerror})") from None
+
+
 def bad_input(error: Exception) -> int:
     """One line about what was wrong with the input; the exit code that says so."""
     print(f"error: {error}", file=sys.stderr)
     return EXIT_BAD_INPUT
+
+
+def printable(text: str) -> str:
+    """Text from a file as a terminal may take it: without its escapes."""
+    return "".join(c if c.isprintable() else f"\\x{ord(c):02x}" for c in text)
 
 
 def clock(seconds: float) -> str:

@@ -157,12 +157,13 @@ class Run:
     kind: str = "train"  # or pretrain; evaluate and measure are about the trained run with the same settings
     evaluation: dict[str, Any] | None = None  # of kind evaluate: episodes, perturbations, strengths
     protocol: str = "paper"
+    place: Path | None = None  # its folder, if it was read from one that need not be named after it
 
     @functools.cached_property
     def parent(self) -> "Run | None":
         """The run that must be finished before this one can start."""
         if self.is_about_another:
-            return dataclasses.replace(self, kind="train", evaluation=None)
+            return dataclasses.replace(self, kind="train", evaluation=None, place=None)
         return self.pretraining
 
     @property
@@ -235,7 +236,7 @@ class Run:
     @property
     def folder(self) -> Path:
         """Where the run lives; not part of its identity."""
-        return self.runs_dir / self.run_id
+        return self.place or self.runs_dir / self.run_id
 
     @property
     def env_steps(self) -> int:
@@ -248,15 +249,30 @@ class Run:
 
     def to_yaml(self) -> str:
         """The run as text; `Run.from_yaml` gives it back."""
-        plain = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name != "runs_dir"}
+        plain = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name not in ("runs_dir", "place")}
         return yaml.safe_dump(plain | {"config": dataclasses.asdict(self.config)}, sort_keys=False)
 
     @staticmethod
     def from_yaml(text: str, runs_dir: Path) -> "Run":
-        """Rebuild a run from what `to_yaml` wrote."""
-        plain = yaml.safe_load(text)
-        mirror = {"wandb_mode": WandbConfig.mode, "wandb_project": WandbConfig.project}  # older runs do not say
-        return Run(**mirror | plain | {"config": config_class(plain["algo"])(**plain["config"]), "runs_dir": runs_dir})
+        """Rebuild a run from what `to_yaml` wrote.
+
+        Raises:
+            ValueError: that is not what it wrote.
+        """
+        try:
+            plain = yaml.safe_load(text)
+            check_choice("algo", plain["algo"], tuple(ALGORITHMS))
+            check_choice("env", plain["env"], tuple(ENVIRONMENTS))
+            check_choice("kind", plain["kind"], KINDS)
+            for key, kind in {"seed": int, "options": dict, "config": dict, "scale": str}.items():
+                if not isinstance(plain[key], kind):
+                    raise ConfigError(key, plain[key], f"must be {kind.__name__}")
+            mirror = {"wandb_mode": WandbConfig.mode, "wandb_project": WandbConfig.project}  # older runs do not say
+            return Run(
+                **mirror | plain | {"config": config_class(plain["algo"])(**plain["config"]), "runs_dir": runs_dir}
+            )
+        except (yaml.YAMLError, AttributeError, KeyError, TypeError) as error:
+            raise ValueError(f"is not a run's config.yaml ({' '.join(str(error).split())})") from error
 
 
 def digest(path: Path) -> str:

@@ -5,7 +5,9 @@ import functools
 import hashlib
 import itertools
 import json
+import math
 import os
+import sys
 import tempfile
 import time
 from collections.abc import Iterable
@@ -18,6 +20,7 @@ from experiments.config import Run, algorithm, installed
 from experiments.status import write_atomically
 from experiments.train import prepare
 from hippo.core.checkpoint import Checkpoint
+from hippo.core.files import DamagedFile, read_json
 from hippo.core.log import RunLog
 
 REFERENCE = Path(__file__).with_name("reference_costs.json")  # committed; experiments.cost_table --measure writes it
@@ -36,7 +39,7 @@ class Cost:
 
 def cache_file() -> Path:
     """Where measurements are kept."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "hippo-suite" / "costs.json"
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser()) / "hippo-suite" / "costs.json"
 
 
 def key(run: Run) -> str:
@@ -56,11 +59,23 @@ def cpu_name() -> str:
 
 
 def known() -> dict[str, Any]:
-    """The remembered measurements; none where the file is damaged."""
+    """The remembered measurements; none where the file or its place cannot be read, without what is none."""
     try:
-        return json.loads(cache_file().read_text())
-    except (FileNotFoundError, json.JSONDecodeError):
+        found = read_json(cache_file(), {})
+    except (OSError, DamagedFile):
         return {}
+    return {name: entry for name, entry in found.items() if _is_cost(entry)}
+
+
+def _is_cost(entry: Any) -> bool:
+    """Whether an entry of the file is a `Cost`."""
+    kinds = {"seconds_per_step": (float, int), "checkpoint_bytes": int, "row_bytes": int, "measured": str}
+    return (
+        isinstance(entry, dict)
+        and entry.keys() == kinds.keys()
+        and all(isinstance(entry[name], kind) for name, kind in kinds.items())
+        and 0 < entry["seconds_per_step"] < math.inf
+    )
 
 
 def cost(run: Run, table: dict[str, Any] | None = None) -> Cost:
@@ -116,8 +131,11 @@ def calibrate(runs: Iterable[Run]) -> dict[str, Any]:
         print(f"measuring the cost of {run.algo} on {run.env} ({i + 1}/{len(wanted)})", flush=True)
         table[name] = dataclasses.asdict(measure(run))
     if wanted:
-        cache_file().parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(cache_file(), json.dumps(known() | table, indent=1))
+        try:
+            cache_file().parent.mkdir(parents=True, exist_ok=True)
+            write_atomically(cache_file(), json.dumps(known() | table, indent=1))
+        except OSError as error:  # HOME may be anything
+            print(f"warning: what was measured is not remembered: {error}", file=sys.stderr)
     return table
 
 

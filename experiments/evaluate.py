@@ -6,10 +6,13 @@ The same seed gives the same episodes (object positions, wall heights, initial p
 and in every changed environment, so that what differs is the dynamics. Training's random streams are never touched.
 """
 
+import contextlib
 import csv
+import dataclasses
 import io
 import itertools
 import re
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -19,9 +22,10 @@ import torch
 from scipy import stats
 
 from experiments import crossings
-from experiments.command_line import Parser, bad_input, run_command
+from experiments.command_line import Parser, bad_input, check_writable, run_command
 from experiments.config import Run, algorithm
 from experiments.crossings import Crossings, has_walls
+from experiments.manifest import changed_identity, stated
 from experiments.status import read_status, write_atomically
 from hippo.core import seeding
 from hippo.core.checkpoint import Checkpoint, CheckpointError
@@ -46,14 +50,41 @@ COLUMNS = (
 
 
 def load_run(folder: Path) -> Run:
-    """The run that lives in `folder`.
+    """The run that lives in `folder`, which is read whatever it is called; where its name or content differ, stderr
+    says so.
 
     Raises:
         ConfigError: it is no run folder.
     """
     if not (folder / "config.yaml").exists():
         raise ConfigError("run", folder, "is no run folder: it has no config.yaml")
-    return Run.from_yaml((folder / "config.yaml").read_text(), folder.parent)
+    try:
+        run = Run.from_yaml((folder / "config.yaml").read_text(), folder.parent)
+    except (OSError, ValueError) as error:
+        raise ConfigError("run", folder / "config.yaml", f"cannot be read: {error}") from None
+    manifest = stated(folder)
+    here = dataclasses.replace(run, place=folder)
+    with contextlib.suppress(OSError):  # the skills that it started from are not here, nor needed
+        if manifest and manifest["run_id"] != run.run_id:
+            differing = changed_identity(manifest["identity"], run)
+            _note(f"{folder} is run {manifest['run_id']}, under this code it would be {run.run_id}: {differing}")
+    if manifest and folder.resolve().name != manifest["run_id"]:
+        _note(f"{folder} is a copy of run {manifest['run_id']}; what is read is {folder}")
+    return here
+
+
+def _note(text: str) -> None:
+    print(f"note: {text}", file=sys.stderr, flush=True)
+
+
+def trained(run: Run) -> Checkpoint:
+    """The checkpoint of a run, which must be of the run that its folder states."""
+    return Checkpoint(run.folder, name_of(run))
+
+
+def name_of(run: Run) -> str:
+    """The id under which a run was trained."""
+    return stated(run.folder).get("run_id") or run.run_id
 
 
 def load_finished_run(folder: Path) -> Run:
@@ -99,10 +130,10 @@ def evaluate(run: Run, episodes: int, seed: int, greedy: bool = False, **changes
     if has_walls(envs):
         envs = Crossings(envs)
     streams = seeding.integer(seed, "evaluation of a policy")
-    steps = algorithm(run.algo).rollout(run.restored_config, envs, streams, Checkpoint(run.folder), greedy)
+    steps = algorithm(run.algo).rollout(run.restored_config, envs, streams, trained(run), greedy)
     returns, lengths = opening_episodes(steps.reward.numpy(), steps.done.numpy())
     common = {
-        "run_id": run.run_id,
+        "run_id": name_of(run),
         "algo": run.algo,
         "env": run.env,
         "perturbation": envs.options.perturbation or "none",
@@ -189,6 +220,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
     try:
+        if options.out is not None:
+            check_writable("--out", options.out)
         run = load_run(options.run)
         changes = {"perturbation": options.perturbation, "strength": options.strength}
         rows = evaluate(run, options.episodes, options.seed, options.greedy, **changes)

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from experiments.command_line import Parser, bad_input, run_command
-from experiments.evaluate import load_finished_run
+from experiments.evaluate import load_finished_run, name_of
 from hippo.core import checkpoint
 from hippo.core.checkpoint import CheckpointError
 from hippo.core.settings import ConfigError
@@ -28,8 +28,8 @@ def export(folder: Path, target: Path) -> Path:
     """
     run = load_finished_run(folder)
     content = checkpoint.load(folder / "checkpoint.pt")
-    kept = {name: part for name, part in content.items() if name in ("iteration", *ACTING)}
-    place = target / run.run_id
+    kept = {name: part for name, part in content.items() if name in ("iteration", "run_id", *ACTING)}
+    place = target / name_of(run)
     place.mkdir(parents=True, exist_ok=True)
     for name in COPIED:
         shutil.copyfile(folder / name, place / name)

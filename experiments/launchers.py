@@ -1,9 +1,11 @@
 """Where runs are trained: a pool of worker processes on this machine."""
 
+import errno
 import multiprocessing
 import os
 import signal
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -13,10 +15,11 @@ from typing import Any
 
 from experiments import costs
 from experiments.config import Run
-from experiments.status import mark_lost
+from experiments.status import mark_lost, read_status
 from experiments.train import execute
 
 POLL_SECONDS = 1.0
+ROOM = 100_000  # bytes, without which no run can go on
 
 
 @dataclass
@@ -29,7 +32,9 @@ class Worker:
 
 
 def _work(connection: Connection) -> None:
-    """Body of a worker process: train what arrives, answer with its final state, until the pipe closes."""
+    """Body of a worker process: train what arrives, answer with its final state and, where its folder cannot be
+    written, why, until the pipe closes.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to the parent, which sends SIGTERM
     while True:
         try:
@@ -37,16 +42,32 @@ def _work(connection: Connection) -> None:
         except EOFError:
             return
         run = Run.from_yaml(text, Path(runs_dir))
-        run.folder.mkdir(parents=True, exist_ok=True)
-        with (run.folder / "train.log").open("a") as log:
-            os.dup2(log.fileno(), 1)
-            os.dup2(log.fileno(), 2)
-        connection.send(execute(run))
+        try:
+            run.folder.mkdir(parents=True, exist_ok=True)
+            with (run.folder / "train.log").open("a") as log:
+                os.dup2(log.fileno(), 1)
+                os.dup2(log.fileno(), 2)
+        except OSError as error:
+            connection.send(("failed", f"cannot be written: {error}"))
+        else:
+            connection.send((execute(run), ""))
 
 
 def cause(exit_code: int) -> str:
     """Why a process ended, in words: the signal's name for a negative code."""
     return signal.Signals(-exit_code).name if exit_code < 0 else f"exit code {exit_code}"
+
+
+def is_full(folder: Path) -> bool:
+    """Whether a small file cannot be written in `folder` for want of space."""
+    try:
+        with tempfile.TemporaryFile(dir=folder) as file:
+            file.write(bytes(ROOM))
+            file.flush()
+            os.fsync(file.fileno())
+    except OSError as error:
+        return error.errno in (errno.ENOSPC, errno.EDQUOT)
+    return False
 
 
 def queue_of(runs: Sequence[Run], in_order: bool) -> list[Run]:
@@ -68,6 +89,8 @@ def run_locally(
     Args:
         on_change: called about once a second with the runs in progress, by id, and the number of those that ended.
         in_order: as they are given instead, as far as parents allow.
+
+    Where the disk is full nothing more is started: what is left keeps the state that its folder says.
 
     Returns:
         Run id -> final state.
@@ -119,12 +142,22 @@ def run_locally(
                 assert worker.run is not None
                 run, worker.run = worker.run, None
                 try:
-                    states[run.run_id] = worker.connection.recv()
+                    states[run.run_id], message = worker.connection.recv()
+                    if message:
+                        print(f"error: {run.run_id} cannot start: {run.folder} {message}", file=sys.stderr)
                 except (EOFError, ConnectionResetError):
                     worker.process.join()
                     states[run.run_id] = "lost"
                     mark_lost(run, f"its process ended: {cause(worker.process.exitcode)}")
                     pool.remove(worker)
+            if queue and any(states.get(i) in ("failed", "lost") for i in chosen) and is_full(runs[0].runs_dir):
+                print(
+                    f"error: no space left on the disk of {runs[0].runs_dir}: {len(queue)} runs are not started; free "
+                    "some, then the same command goes on",
+                    file=sys.stderr,
+                )
+                states |= {run.run_id: read_status(run.folder)["state"] for run in queue}
+                queue.clear()
             give_all()
             on_change({w.run.run_id: w.run for w in pool if w.run is not None}, len(states))
     finally:

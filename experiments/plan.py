@@ -15,7 +15,7 @@ from analysis.edition import PAPER, Edition
 from experiments import costs
 from experiments.command_line import duration
 from experiments.config import COMMITTED, CONF, Run, check_choice, choices, compose_run
-from experiments.status import DONE, is_there, read_status, write_atomically
+from experiments.status import ABANDONED_SECONDS, DONE, is_there, read_status, remove_abandoned, write_atomically
 from hippo.core.settings import ConfigError
 
 FIXED = ("env", "algo", "scale", "protocol", "seed", "runs_dir")  # the plan's own business, not that of --set
@@ -87,6 +87,7 @@ class Plan:
         edition, name = self.edition, self.edition.name(self.figure)
         path = runs_dir / "plans" / edition.folder / f"{name}.json"
         path.parent.mkdir(parents=True, exist_ok=True)
+        remove_abandoned(path.parent, ABANDONED_SECONDS)
         left_out = self.description.get("not_trained", {}).get(edition.scale, [])
         content = {
             "figure": name,

@@ -12,6 +12,7 @@ import getpass
 import hashlib
 import json
 import os
+import re
 import shlex
 import shutil
 import subprocess
@@ -30,7 +31,7 @@ from experiments import costs
 from experiments.command_line import duration
 from experiments.config import CONF, Run, nearest
 from experiments.manifest import ROOT, code_version, git
-from experiments.status import locked, read_status, write_atomically
+from experiments.status import ABANDONED_SECONDS, locked, read_status, remove_abandoned, write_atomically
 from experiments.train import execute
 from hippo.core.settings import ConfigError, check, setting
 
@@ -41,6 +42,25 @@ LIVE = {
 }
 
 
+# What Slurm's own names and expressions are made of, and nothing that ends a line or a word of the script.
+TEXT = re.compile(r"[\w.,:@+*&|()\[\]-]+")
+JOB_NAME = re.compile("hippo-[0-9a-f]{10}")
+# What a job runs; a snapshot never holds runs, data, environments or earlier snapshots.
+CODE = (
+    "hippo",
+    "baselines",
+    "experiments",
+    "analysis",
+    "paper_figures/*.py",
+    "paper_figures/data/skills",
+    "*.toml",
+    "*.lock",
+)
+CODE_SUFFIXES = (".py", ".yaml", ".xml", ".json", ".pt", ".toml", ".lock", ".typed")
+YEAR = 365 * 24 * 60  # minutes
+MOST_CODE = 50_000_000  # bytes of a snapshot
+
+
 @dataclass
 class Profile:
     """What a job asks for; conf/slurm/default.yaml."""
@@ -48,15 +68,29 @@ class Profile:
     partition: str | None = setting(None, "partition, null for the cluster's default")
     account: str | None = setting(None, "account")
     constraint: str | None = setting(None, "constraint on nodes, e.g. a CPU model")
-    time_minutes: int = setting(240, "time limit of a job; two at least, for the signal may come a minute early", low=2)
-    memory_gb: float = setting(2.0, "memory of a job", above=0.0)
-    cpus: int = setting(1, "CPUs of a job", low=1)
-    parallel: int = setting(100, "jobs of one array that may run at the same time", low=1)
-    group_minutes: int = setting(60, "short runs share a job of about this length; 0: a job each", low=0)
-    signal_seconds: int = setting(60, "seconds before the limit at which a job is told to stop", low=10)
+    time_minutes: int = setting(
+        240, "time limit of a job; two at least, for the signal may come a minute early", low=2, high=YEAR
+    )
+    memory_gb: float = setting(2.0, "memory of a job", low=0.1, high=100_000)
+    cpus: int = setting(1, "CPUs of a job", low=1, high=10_000)
+    parallel: int = setting(100, "jobs of one array that may run at the same time", low=1, high=10_000)
+    group_minutes: int = setting(60, "short runs share a job of about this length; 0: a job each", low=0, high=YEAR)
+    signal_seconds: int = setting(60, "seconds before the limit at which a job is told to stop", low=10, high=65_535)
 
     def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if field.name in ("partition", "account", "constraint"):
+                if value is not None and not (isinstance(value, str) and TEXT.fullmatch(value)):
+                    valid = f"must be null or text of letters, digits and {TEXT.pattern}"
+                    raise ConfigError(f"profile {field.name}", repr(value), valid)
+            elif isinstance(value, bool) or not isinstance(value, (int, float) if field.type is float else int):
+                kind = "a number" if field.type is float else "a whole number"
+                raise ConfigError(f"profile {field.name}", repr(value), f"must be {kind}")
         check(self)
+        if self.signal_seconds >= 60 * self.time_minutes:
+            limit = f"must be below the time limit, {self.time_minutes} minutes"
+            raise ConfigError("profile signal_seconds", self.signal_seconds, limit)
 
 
 def load_profile(path: Path | None) -> Profile:
@@ -68,8 +102,8 @@ def load_profile(path: Path | None) -> Profile:
     path = CONF / "slurm" / "default.yaml" if path is None else path
     try:
         content = yaml.safe_load(path.read_text())
-    except (OSError, yaml.YAMLError) as error:
-        raise ConfigError("profile", path, f"must be a yaml file ({error})") from error
+    except (OSError, ValueError, yaml.YAMLError) as error:
+        raise ConfigError("profile", path, f"must be a yaml file ({' '.join(str(error).split())})") from error
     valid = [f.name for f in dataclasses.fields(Profile)]
     if not isinstance(content, dict):
         raise ConfigError("profile", path, f"must set some of {', '.join(valid)}")
@@ -141,6 +175,8 @@ def submit(runs: Sequence[Run], runs_dir: Path, profile: Profile, dry_run: bool)
     """
     folder = runs_dir.absolute() / "slurm"
     with _private(folder), locked(folder / "submit.lock", timeout=-1):
+        for place in (folder, folder / "batches"):
+            remove_abandoned(place, ABANDONED_SECONDS)
         live = queued(runs_dir)
         todo = [run for run in runs if run.run_id not in live and read_status(run.folder)["state"] != "running"]
         table, size = costs.known(), max_array_size()
@@ -236,25 +272,75 @@ def _dependency(before: list[str]) -> dict[str, str]:
     return {"dependency": f"afterany:{':'.join(before)}"} if before else {}
 
 
-def snapshot(folder: Path) -> Path:
-    """A copy of the code as it is now, which queued jobs run whatever happens to the working tree meanwhile."""
-    names = git("ls-files", "--cached", "--others", "--exclude-standard").splitlines()
-    files = [ROOT / name for name in names] or [p for p in ROOT.rglob("*") if ".venv" not in p.parts]
-    files = sorted(p for p in files if p.is_file())
+def code_files() -> list[Path]:
+    """The files that a job runs: of CODE, those that git tracks or would, or all where git cannot say."""
+    known = git("ls-files", "--cached", "--others", "--exclude-standard", "-z")
+    names = None if known is None else {ROOT / name for name in known.split("\0")}
+    found = [
+        path
+        for pattern in CODE
+        for place in ROOT.glob(pattern)
+        for path in ([place] if place.is_file() else place.rglob("*"))
+        if path.is_file() and path.suffix in CODE_SUFFIXES and (names is None or path in names)
+    ]
+    return sorted(set(found))
+
+
+def digest_of(files: Sequence[Path], root: Path) -> str:
+    """The digest that a snapshot is named by, of the names under `root` and the contents of files."""
     digest = hashlib.sha256()
     for path in files:
-        digest.update(str(path.relative_to(ROOT)).encode() + b"\0" + path.read_bytes())
-    target = folder / f"code-{digest.hexdigest()[:12]}"
-    if not target.exists():
-        temporary = folder / f"{target.name}.{os.getpid()}.tmp"
-        compiled = ROOT.glob("hippo/**/__pycache__/*.nb?")  # numba's kernels: 15 seconds that no job need spend
-        for path in [*files, *compiled]:
-            copy = temporary / path.relative_to(ROOT)
-            copy.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copy2(path, copy)  # with its time: a kernel is as good as new while its source's is the same
-        (temporary / "snapshot.json").write_text(json.dumps(code_version()))
-        temporary.rename(target)
+        digest.update(str(path.relative_to(root)).encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()[:12]
+
+
+def snapshot(folder: Path) -> Path:
+    """A copy of the code as it is now, which queued jobs run whatever happens to the working tree meanwhile.
+
+    One that is there already is taken only if it is what its name says.
+
+    Raises:
+        ConfigError: it is not, or the code is too large to be code.
+    """
+    files = code_files()
+    size = sum(path.stat().st_size for path in files)
+    if size > MOST_CODE:
+        largest = max(files, key=lambda path: path.stat().st_size)
+        valid = f"at most {MOST_CODE:,} bytes of code are copied for jobs; the largest is {largest.relative_to(ROOT)}"
+        raise ConfigError("code", f"{size:,} bytes", valid)
+    digest = digest_of(files, ROOT)
+    target = folder / f"code-{digest}"
+    if target.exists():
+        check_snapshot(target, digest)
+        return target
+    temporary = folder / f"{target.name}.{os.getpid()}.tmp"
+    shutil.rmtree(temporary, ignore_errors=True)
+    compiled = ROOT.glob("hippo/**/__pycache__/*.nb?")  # numba's kernels: 15 seconds that no job need spend
+    for path in [*files, *compiled]:
+        copy = temporary / path.relative_to(ROOT)
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy2(path, copy)  # with its time: a kernel is as good as new while its source's is the same
+    (temporary / "snapshot.json").write_text(json.dumps(code_version()))
+    temporary.rename(target)
     return target
+
+
+def check_snapshot(target: Path, digest: str) -> None:
+    """Raise ConfigError unless a snapshot holds the code that its name says, and nothing else but compiled kernels.
+
+    Bytecode is not trusted: it is deleted, and made again by the next job.
+    """
+    there = sorted(path for path in target.rglob("*") if not path.is_dir() or path.is_symlink())
+    for path in [path for path in there if path.suffix == ".pyc"]:
+        path.unlink(missing_ok=True)
+    files = [path for path in there if "__pycache__" not in path.parts and path != target / "snapshot.json"]
+    if any(path.is_symlink() for path in there) or digest_of(files, target) != digest:
+        raise ConfigError("snapshot", target, "is not the code that its name says; delete it")
+    for path in there:
+        if path.suffix in (".nbi", ".nbc"):
+            ours = ROOT / path.relative_to(target)
+            if not ours.exists() or ours.read_bytes() != path.read_bytes():
+                path.unlink(missing_ok=True)
 
 
 # --------------------------------------------------------------------------------------------------------------- queue
@@ -277,10 +363,19 @@ def _ask(*command: str) -> str:
         raise ConfigError("launcher", "slurm", f"{command[0]} failed: {' '.join(message.split())}") from error
 
 
+def check_installed() -> None:
+    """Raise ConfigError where Slurm's commands are not here, before anything is written."""
+    for command in ("sbatch", "squeue", "scontrol"):
+        if shutil.which(command) is None:
+            raise ConfigError("launcher", "slurm", f"needs Slurm's {command} on this machine; valid here: local")
+
+
 def max_array_size() -> int:
     """How many jobs one array may have."""
-    lines = _ask("scontrol", "show", "config").splitlines()
-    return next(int(line.split("=")[1]) for line in lines if line.startswith("MaxArraySize")) - 1
+    found = re.search(r"^MaxArraySize\s*=\s*(\d+)", _ask("scontrol", "show", "config"), re.MULTILINE)
+    if found is None:
+        raise ConfigError("launcher", "slurm", "scontrol show config does not say MaxArraySize")
+    return int(found[1]) - 1
 
 
 def queued(runs_dir: Path) -> dict[str, str]:
@@ -289,13 +384,26 @@ def queued(runs_dir: Path) -> dict[str, str]:
     if not batches.exists():
         return {}
     live: dict[str, str] = {}
-    for line in _ask("squeue", "-h", "-r", "-u", getpass.getuser(), "-o", "%j|%K|%F|%T").splitlines():
-        name, index, job, state = line.split("|")
+    # The name last: a job of somebody else's making may have anything in it.
+    for line in _ask("squeue", "-h", "-r", "-u", getpass.getuser(), "-o", "%K|%F|%T|%j").splitlines():
+        index, job, state, name = [*line.split("|", 3), "", "", ""][:4]
         path = batches / f"{name}.json"
-        if state in LIVE and path.exists():
-            groups = json.loads(path.read_text())
-            live |= dict.fromkeys(groups[int(index) if index.isdigit() else 0], f"{job}_{index}")
+        if state in LIVE and JOB_NAME.fullmatch(name) and path.exists():
+            live |= dict.fromkeys(_batch(path, int(index) if index.isdigit() else 0), f"{job}_{index}")
     return live
+
+
+def _batch(path: Path, index: int) -> list[str]:
+    """The run ids behind one index of an array; none, and a word about it, where the file is damaged."""
+    try:
+        groups = json.loads(path.read_bytes())
+        group = groups[index]
+        if not isinstance(group, list) or not all(isinstance(run_id, str) for run_id in group):
+            raise ValueError("no list of run ids")
+    except (OSError, ValueError, LookupError, TypeError) as error:
+        print(f"warning: {path}: cannot be read ({error}); its jobs may be submitted again", file=sys.stderr)
+        return []
+    return group
 
 
 def wait(runs: Sequence[Run], runs_dir: Path, report: Callable[[Sequence[Run], int], None]) -> dict[str, str]:

@@ -2,9 +2,12 @@
 
 import contextlib
 import errno
+import functools
 import json
+import math
 import multiprocessing
 import os
+import shutil
 import signal
 import socket
 import sys
@@ -18,11 +21,26 @@ from typing import Any
 from filelock import FileLock, SoftFileLock, Timeout
 
 from experiments.config import Run, committed_skills
+from hippo.core.files import DamagedFile, check_object, read_json, sync_folder, write_synced
+from hippo.core.results import damage
 
 HEARTBEAT_SECONDS = 5.0
 LOST_AFTER_SECONDS = 6 * HEARTBEAT_SECONDS
+TAKE_OVER_SECONDS = 20 * LOST_AFTER_SECONDS  # of silence, after which a soft lock counts for nothing
+ABANDONED_SECONDS = 60.0  # after which a temporary file of a process that is not here counts as left behind
 DONE = ("finished", "committed")
 SOFT_LOCKS = "HIPPO_SOFT_LOCKS"  # environment variable
+STATES = ("running", "finished", "preempted", "failed", "diverged", "lost")
+NUMBER = (float, type(None))
+SCHEMA: dict[str, type | tuple[type, ...]] = {"state": str}
+# What else a status may say, and must say in these types.
+OPTIONAL: dict[str, type | tuple[type, ...]] = {
+    **dict.fromkeys(("iteration", "iterations", "env_steps", "attempts", "pid"), int),
+    **dict.fromkeys(("heartbeat", "started"), float),
+    **dict.fromkeys(("steps_per_second", "eta", "return_mean"), NUMBER),
+    **dict.fromkeys(("message", "host", "cause"), str),
+    "results": dict,
+}
 NOT_SUPPORTED = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)  # flock's answers of a file system without locks
 
 
@@ -44,8 +62,12 @@ def locked(path: Path, timeout: float = 0.0) -> Iterator[None]:
         Timeout: somebody else holds it for longer than `timeout` seconds (negative: for ever).
         NoLocks: the file system has none.
     """
+    soft = path.with_name(f"{path.name}.soft")
     if os.environ.get(SOFT_LOCKS) == "1":
-        lock: Any = SoftFileLock(path.with_name(f"{path.name}.soft"), timeout=timeout)
+        lock: Any = SoftFileLock(soft, timeout=timeout)
+        if abandoned(soft):
+            print(f"warning: {soft}: its owner has been silent for too long; taken over", file=sys.stderr, flush=True)
+            soft.unlink(missing_ok=True)
     else:
         lock = FileLock(path, timeout=timeout, fallback_to_soft=False)
     try:
@@ -56,6 +78,26 @@ def locked(path: Path, timeout: float = 0.0) -> Iterator[None]:
         yield
     finally:
         lock.release()
+
+
+def abandoned(soft: Path) -> bool:
+    """Whether the owner of a run's soft lock is gone: its heartbeat, and that of the lock, stopped long ago."""
+    return (
+        soft.is_file()
+        and (soft.parent / "status.json").exists()
+        and min(silence(soft), silence(soft.parent / "status.json")) > TAKE_OVER_SECONDS
+    )
+
+
+def is_locked(folder: Path) -> bool:
+    """Whether somebody holds the lock of a run's folder."""
+    try:
+        with locked(folder / ".lock"):
+            return False
+    except Timeout:
+        return True
+    except OSError:
+        return False
 
 
 def check_locks(folder: Path) -> None:
@@ -85,16 +127,20 @@ class Status:
         self.stopped_by = ""  # the signal that ended the run
 
     def update(self, **changes: Any) -> None:
-        """Change some entries and write the file."""
+        """Change some entries and write the file; what does not change the state need not survive a power cut."""
         with self.lock:
             self.content |= {**changes, "heartbeat": time.time()}
-            write_atomically(self.path, json.dumps(self.content, indent=1))
+            write_atomically(self.path, json.dumps(self.content, indent=1), synced="state" in changes)
 
     def end(self, state: str, message: str = "", **changes: Any) -> None:
         """The last word about the run; where even that cannot be written, the silence will read as "lost"."""
         try:
             self.update(state=state, message=message, **changes)
         except OSError as error:
+            with contextlib.suppress(OSError), self.path.open("r+") as file:  # a full disk has room for the old file
+                file.write(json.dumps(self.content))
+                file.truncate()
+                return
             print(f"warning: {self.path} not written: {error}", file=sys.stderr, flush=True)
 
     @contextlib.contextmanager
@@ -104,6 +150,9 @@ class Status:
 
         def beat() -> None:
             while not stop.wait(HEARTBEAT_SECONDS):
+                if self._taken_over():
+                    os.kill(os.getpid(), signal.SIGTERM)
+                    return
                 with contextlib.suppress(OSError):  # a full disk; training itself will say so where it matters
                     self.update()
                 if sweep is not None and not sweep.is_alive():
@@ -117,36 +166,87 @@ class Status:
             stop.set()
             thread.join()
 
+    def _taken_over(self) -> bool:
+        """Whether another process, to which we looked gone, has taken our soft lock over."""
+        if os.environ.get(SOFT_LOCKS) != "1":
+            return False
+        written = read_status(self.path.parent)
+        owner = (self.content["host"], self.content["pid"])
+        return "pid" in written and (written.get("host"), written["pid"]) != owner
 
-def write_atomically(path: Path, text: str) -> None:
-    """Replace `path` so that a reader sees the old or the new text, never a part."""
+
+def write_atomically(path: Path, text: str, synced: bool = True) -> None:
+    """Replace `path` so that a reader sees the old or the new text, never a part, after a power cut neither."""
     temporary = path.with_name(f"{path.name}.{os.getpid()}.tmp")  # two sweeps may write the same plan
     try:
-        temporary.write_text(text)
+        if synced:
+            write_synced(temporary, text.encode())
+        else:
+            temporary.write_text(text)
         temporary.replace(path)
+        if synced:
+            sync_folder(path.parent)
     finally:
         temporary.unlink(missing_ok=True)
 
 
-def remove_abandoned(folder: Path) -> None:
-    """Delete what a process that was killed in `write_atomically` left in `folder`."""
+def remove_abandoned(folder: Path, older_than: float = 0.0) -> None:
+    """Delete what a process that was killed while it wrote left in `folder`, its files and folders <name>.<pid>.tmp.
+
+    Args:
+        older_than: seconds; where processes of other hosts write, too, whose ids say nothing here.
+    """
     for path in folder.glob("*.tmp"):
         pid = path.suffixes[-2][1:] if len(path.suffixes) > 1 else ""
-        if pid.isdigit() and not Path(f"/proc/{pid}").exists():
-            path.unlink(missing_ok=True)
+        if pid.isdigit() and not Path(f"/proc/{pid}").exists() and silence(path) >= older_than:
+            shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)
 
 
 def read_status(folder: Path) -> dict[str, Any]:
-    """A run's status; state "missing" where it never started, "lost" where its heartbeat stopped or it is damaged."""
+    """A run's status.
+
+    State "missing" where it never started; "lost" where its heartbeat stopped, where status.json is damaged, or where
+    the results of a finished run are no longer what it wrote.
+    """
+    path = folder / "status.json"
     try:
-        status = json.loads((folder / "status.json").read_text())
-    except FileNotFoundError:
+        status = read_json(path, SCHEMA)
+        for key, kinds in OPTIONAL.items():
+            if key in status:
+                check_object(path, status, {key: kinds})
+        if status["state"] not in STATES:
+            raise DamagedFile(f"{path}: state {status['state']!r:.60} is none of {', '.join(STATES)}")
+    except (FileNotFoundError, NotADirectoryError):
         return {"state": "missing", "iteration": -1, "message": ""}
-    except json.JSONDecodeError:  # a power cut; the checkpoint has its own digest
+    except (DamagedFile, OSError):  # a power cut; the checkpoint has its own digest
         return {"state": "lost", "iteration": -1, "message": "status.json is damaged"}
-    if status["state"] == "running" and time.time() - status["heartbeat"] > LOST_AFTER_SECONDS:
-        status |= {"state": "lost", "message": status.get("message") or "its heartbeat stopped"}
+    status = {"iteration": -1, "message": ""} | status
+    if status["state"] == "running" and silence(path) > LOST_AFTER_SECONDS:
+        status |= {"state": "lost", "message": status["message"] or "its heartbeat stopped"}
+    if status["state"] == "finished" and (wrong := damage(folder, status.get("iterations", 1), status.get("results"))):
+        status |= {"state": "lost", "message": f"{wrong}; the same command trains what is missing"}
     return status
+
+
+def silence(path: Path) -> float:
+    """Seconds since a file was written, by the clock of its file system: that of a host may be wrong."""
+    try:
+        return time.time() + _clock_ahead(path.parent.parent) - path.stat().st_mtime
+    except OSError:
+        return math.inf
+
+
+@functools.cache
+def _clock_ahead(folder: Path) -> float:
+    """Seconds by which the clock of a folder's file system is ahead of this host's; 0 where nothing can be written."""
+    try:
+        with tempfile.TemporaryFile(dir=folder) as file:
+            file.write(b"now")
+            file.flush()
+            ahead = os.fstat(file.fileno()).st_mtime - time.time()
+    except OSError:
+        return 0.0
+    return ahead if abs(ahead) > HEARTBEAT_SECONDS else 0.0
 
 
 def is_there(run: Run, fresh: bool = False) -> bool:
@@ -156,7 +256,16 @@ def is_there(run: Run, fresh: bool = False) -> bool:
 
 def mark_lost(run: Run, message: str) -> None:
     """Say in its status.json that the process that trained `run` is gone, unless another has taken the run over."""
-    with contextlib.suppress(Timeout, NoLocks), locked(run.folder / ".lock"):
+    _mark(run, "lost", message)
+
+
+def mark_failed(run: Run, message: str) -> None:
+    """Say in its status.json why `run` did not even start."""
+    _mark(run, "failed", message)
+
+
+def _mark(run: Run, state: str, message: str) -> None:
+    with contextlib.suppress(Timeout, OSError), locked(run.folder / ".lock"):
         status = read_status(run.folder)
         if status["state"] not in ("finished", "diverged"):
-            write_atomically(run.folder / "status.json", json.dumps(status | {"state": "lost", "message": message}))
+            write_atomically(run.folder / "status.json", json.dumps(status | {"state": state, "message": message}))

@@ -15,17 +15,27 @@ import shlex
 import shutil
 import signal
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from experiments import costs, slurm
-from experiments.command_line import EXIT_FAILED, EXIT_NOT_AGREED, EXIT_REQUEUE, Parser, bad_input, clock, run_command
+from experiments.command_line import (
+    EXIT_FAILED,
+    EXIT_NOT_AGREED,
+    EXIT_REQUEUE,
+    Parser,
+    bad_input,
+    clock,
+    printable,
+    run_command,
+)
 from experiments.config import Run, check_choice, choices
 from experiments.console import unattended
 from experiments.launchers import run_locally
 from experiments.plan import Plan, make_plan, overview, refused_lines, summary, trained_at
-from experiments.status import DONE, NoLocks, check_locks, read_status
+from experiments.status import DONE, check_locks, is_locked, read_status
 from hippo.core.settings import ConfigError
 
 LAUNCHERS = ("local", "slurm")
@@ -60,8 +70,10 @@ def train_all(todo: Sequence[Run], workers: int, report: Report, in_order: bool 
         while elsewhere and not here:
             time.sleep(1.0)
             states |= {run.run_id: read_status(run.folder)["state"] for run in elsewhere}
-            here = [run for run in elsewhere if states[run.run_id] in ("lost", "preempted")]
-            elsewhere = [run for run in elsewhere if states[run.run_id] == "running"]
+            given_up = [run for run in elsewhere if states[run.run_id] in ("lost", "preempted")]
+            here = [run for run in given_up if not is_locked(run.folder)]  # a stopped process still holds its own
+            elsewhere = [run for run in elsewhere if states[run.run_id] == "running" or run in given_up]
+            elsewhere = [run for run in elsewhere if run not in here]
             report(elsewhere, len(todo) - len(elsewhere) - len(here))
     return states
 
@@ -122,7 +134,10 @@ def run_figure(plan: Plan, todo: Sequence[Run], train: TrainAll, runs_dir: Path)
             signal.signal(number, handler)
     for entry in plan.entries:
         entry.state = states.get(entry.run.run_id, entry.state)
-    plan.write(runs_dir)
+    try:
+        plan.write(runs_dir)
+    except OSError as error:
+        print(f"error: the plan of {plan.figure} is not written: {error}", file=sys.stderr)
     if todo:
         start_of_line = "\r" if terminal else ""
         print(f"{start_of_line}[{len(todo)}/{len(todo)}] done in {clock(time.monotonic() - started)}")
@@ -156,7 +171,7 @@ def name_failures(plan: Plan, todo: Sequence[Run], states: dict[str, str]) -> in
         name = names.get(run_id, f"{run.env} {run.algo} seed {run.seed}")
         unfinished = [a.run_id for a in run.ancestors if a.run_id in bad]
         message = f"needs {unfinished[0]}" if unfinished else read_status(run.folder).get("message", "")
-        print(f"{state}: {name}: {message} (log: {run.folder / 'train.log'})", file=sys.stderr)
+        print(f"{state}: {name}: {printable(message)} (log: {run.folder / 'train.log'})", file=sys.stderr)
     return EXIT_FAILED if bad else 0
 
 
@@ -181,7 +196,7 @@ def status_table(plan: Plan, waiting: dict[str, str]) -> str:
         cells = f"{run.env:18} {variant:22} {run.seed:4}  {state:10} {done:>11} {eta:>8} {speed:>9}"
         lines.append(f"{run.run_id:12}  {cells}".rstrip())
         if state in ("failed", "diverged", "lost", "preempted"):
-            lines.append(f"{'':14}{s['message'] or state} (log: {run.folder / 'train.log'})")
+            lines.append(f"{'':14}{printable(s['message'] or state)} (log: {run.folder / 'train.log'})")
     to_retry = may_retry(plan)
     if to_retry:
         lines.append(
@@ -244,7 +259,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return ACTIONS[options.action](options, plan_of)
     except ConfigError as error:
         return bad_input(error)
-    except NoLocks as error:
+    except OSError as error:  # of a file system without locks, too
         print(f"error: {error}", file=sys.stderr)
         return EXIT_FAILED
 
@@ -259,6 +274,16 @@ def check_options(options: argparse.Namespace) -> None:
         raise ConfigError("max-core-hours", options.max_core_hours, "must be 0 or more; --yes starts any number")
 
 
+def check_runs_dir(folder: Path) -> None:
+    """Raise ConfigError unless runs can be written in `folder`, which is made where it is missing."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise ConfigError("runs-dir", folder, f"must be a folder that can be written ({error.strerror})") from None
+
+
 def show_plan(options: argparse.Namespace, plan_of: Callable[[str], Plan]) -> int:
     """`plan`."""
     print(overview([plan_of(figure) for figure in named(options)], options.workers))
@@ -267,7 +292,9 @@ def show_plan(options: argparse.Namespace, plan_of: Callable[[str], Plan]) -> in
 
 def write_plans(options: argparse.Namespace, plan_of: Callable[[str], Plan]) -> int:
     """`write`."""
-    for plan in [plan_of(figure) for figure in named(options)]:
+    plans = [plan_of(figure) for figure in named(options)]
+    check_runs_dir(options.runs_dir)
+    for plan in plans:
         plan.write(options.runs_dir)
     return 0
 
@@ -302,10 +329,14 @@ def run_or_retry(options: argparse.Namespace, plan_of: Callable[[str], Plan]) ->
         return 0
     todo = plan.todo() if options.action == "run" else may_retry(plan)
     profile = slurm.load_profile(options.profile) if options.launcher == "slurm" else None
+    if profile is not None:
+        slurm.check_installed()
     hours = sum(costs.reference_seconds(run) for run in todo) / 3600
     if hours >= options.max_core_hours and todo and not options.yes and not options.dry_run:
         print(ask(plan, len(todo), hours, options), file=sys.stderr)
         return EXIT_NOT_AGREED
+    if not options.dry_run:
+        check_runs_dir(options.runs_dir)
     if options.action == "run" and options.scale != "smoke" and not options.dry_run:
         costs.calibrate(todo)
     print(summary(plan), flush=True)

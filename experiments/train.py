@@ -37,6 +37,7 @@ from experiments.status import (
     Status,
     is_there,
     locked,
+    mark_failed,
     read_status,
     remove_abandoned,
     write_atomically,
@@ -44,8 +45,9 @@ from experiments.status import (
 from hippo import gradients
 from hippo.core import checkpoint, seeding
 from hippo.core.checkpoint import Checkpoint, CheckpointError
-from hippo.core.log import Diverged, Row, RunLog
+from hippo.core.log import Diverged, LogError, Row, RunLog
 from hippo.core.mirror import mirrored
+from hippo.core.results import digests
 from hippo.core.settings import ConfigError
 from hippo.core.skills import SkillsError, save_skills
 from hippo.envs import make
@@ -72,11 +74,16 @@ def execute(run: Run) -> str:
     except Timeout:
         status = read_status(run.folder)
         soft = run.folder / ".lock.soft"
-        stale = f"; if it is not, delete {soft}" if status["state"] != "running" and soft.exists() else ""
-        print(f"{run.run_id} is already running (host {status.get('host')}, pid {status.get('pid')}){stale}")
+        silent = "" if status["state"] == "running" else ", which holds its lock and has been silent: stopped?"
+        stale = f" If it is gone, delete {soft}" if silent and soft.exists() else ""
+        print(f"{run.run_id} is already running (host {status.get('host')}, pid {status.get('pid')}){silent}{stale}")
         return "running"
     except OSError as error:
         print(f"error: {run.run_id} cannot start: {error}", file=sys.stderr)
+        return "failed"
+    except Exception as error:  # before there was a status to say so
+        traceback.print_exc()
+        mark_failed(run, f"{type(error).__name__}: {error}".splitlines()[0])
         return "failed"
 
 
@@ -120,7 +127,7 @@ def _work(run: Run, status: Status) -> None:
     """Do the run; its last status and line say how that ended."""
     try:
         WORK[run.kind](run, status)
-        status.update(state="finished", message="")
+        status.update(state="finished", message="", results=digests(run.folder))
         print(what_next(run), flush=True)
     except Diverged as error:
         checkpoint.save(run.folder / "diverged.pt", error.dump)
@@ -132,6 +139,9 @@ def _work(run: Run, status: Status) -> None:
         message = f"{error or type(error).__name__}; start it again to continue from the last checkpoint"
         status.end("failed", message, cause="infrastructure")
         print(f"error: {message}", file=sys.stderr)
+    except LogError as error:
+        status.end("failed", str(error), cause="infrastructure")
+        print(f"error: {error}", file=sys.stderr)
     except (CheckpointError, SkillsError) as error:
         status.end("failed", str(error), cause="error")
         print(f"error: {error}", file=sys.stderr)
@@ -223,13 +233,16 @@ def train(run: Run, status: Status) -> None:
             eta=round(eta),
         )
 
-    algorithm(run.algo).train(with_skills(run), make_envs, RunLog(run.folder, on_row), run.seed, Checkpoint(run.folder))
+    log = RunLog(run.folder, on_row)
+    saved = Checkpoint(run.folder, run.run_id, log)
+    algorithm(run.algo).train(with_skills(run), make_envs, log, run.seed, saved)
+    log.check_whole(run.config.iterations)
 
 
 def pretrain(run: Run, status: Status) -> None:
     """Train skills and write them to skills.pt."""
     train(run, status)
-    policy, metadata = algorithm(run.algo).skills(run.config, prepare(run), Checkpoint(run.folder))
+    policy, metadata = algorithm(run.algo).skills(run.config, prepare(run), Checkpoint(run.folder, run.run_id))
     save_skills(run.folder / "skills.pt", policy, metadata | {"run_id": run.run_id})
 
 
@@ -248,7 +261,8 @@ def measure(run: Run, status: Status) -> None:
     """Table 2's quantities of the parent run, as the single row of progress.csv."""
     assert run.parent is not None
     make_envs, start = prepare(run), time.perf_counter()
-    metrics = gradients.measure(run.restored_config, make_envs, run.seed, Checkpoint(run.parent.folder))
+    trained = Checkpoint(run.parent.folder, run.parent.run_id)
+    metrics = gradients.measure(run.restored_config, make_envs, run.seed, trained)
     log = RunLog(run.folder)
     log.resume(0)
     log.row(metrics, {"seconds": time.perf_counter() - start})

@@ -21,9 +21,10 @@ from matplotlib.patheffects import withStroke
 
 from analysis import stats
 from analysis.edition import PAPER, Edition
-from analysis.runs import Results, scores
+from analysis.runs import COLUMNS, Results, scores
 from paper_figures import command_line, style
 
+MOST_POINTS = 4000  # of a curve that are drawn, several for every pixel
 SHORTER = 0.95  # methods whose budget is below this share of the longest have their last value held
 EDGE = withStroke(linewidth=2.6, foreground="white")  # tells lines that cross or touch apart
 NOT_A_RESULT = {"smoke": "smoke"}  # scales whose pictures say nothing about the methods
@@ -52,7 +53,14 @@ def bundle(results: Results, env: str, variant: str, share: float) -> tuple[np.n
     window = window_of(planned(results, env)[variant]["iterations"], share)
     for seed in table:  # where it has values; at its ends over what the window still covers
         table[seed] = table[seed].dropna().rolling(window, center=True, min_periods=1).mean()
-    return np.array(steps), table.interpolate(method="index", limit_area="inside").to_numpy().T
+    curves = table.interpolate(method="index", limit_area="inside").to_numpy().T
+    chosen = thinned(len(steps))
+    return np.array(steps)[chosen], curves[:, chosen]
+
+
+def thinned(points: int) -> np.ndarray:
+    """Which points of a curve are drawn: all, or MOST_POINTS evenly chosen ones, first and last among them."""
+    return np.unique(np.linspace(0, points - 1, min(points, MOST_POINTS)).round().astype(int))
 
 
 def draw_panel(axes: Axes, results: Results, env: str, unit: float, share: float) -> None:
@@ -84,10 +92,8 @@ def draw_panel(axes: Axes, results: Results, env: str, unit: float, share: float
 
 def seeds_behind(results: Results, env: str) -> dict[str, int]:
     """Number of seeds of every method that has data in one environment, in the plan's order."""
-    frame = results.frame
-    rows = frame[(frame["env"] == env) & (frame["metric"] == "return_mean")]
-    counts = rows.groupby("variant")["seed"].nunique()
-    return {variant: int(counts[variant]) for variant in unique(results, "variant") if variant in counts}
+    counts = results.seeds_with_return
+    return {v: counts[env, v] for v in unique(results, "variant") if (env, v) in counts}
 
 
 def planned(results: Results, env: str) -> dict[str, dict[str, Any]]:
@@ -164,6 +170,16 @@ def left_out(results: Results, extra: "Extra | None") -> str:
     return "; ".join(f"{', '.join(labels)} ({reason})" for reason, labels in reasons.items())
 
 
+def without_value(results: Results) -> str:
+    """How many points of the learning curves are not drawn since they are not finite, in words; empty where none."""
+    frame = results.frame[results.frame["metric"] == "return_mean"]
+    bad = frame[~np.isfinite(frame["value"].astype(float))]
+    if bad.empty:
+        return ""
+    runs = [f"{run_id} ({count})" for run_id, count in bad.groupby("run_id").size().items()]
+    return f"Not finite and so not drawn: {len(bad)} of {len(frame)} values, of runs {', '.join(runs)}."
+
+
 def caption(results: Results, share: float, extra: "Extra | None") -> str:
     """What the picture shows and how it was computed, for a reader who sees nothing else."""
     plan = results.plan
@@ -197,6 +213,8 @@ def caption(results: Results, share: float, extra: "Extra | None") -> str:
     for env in (env for env, of in seeds.items() if of):
         final = final_line(results, env)
         lines.append(f"Last 10 % of iterations, mean ± standard deviation over seeds, {labels[env]}: {final}.")
+    if bad := without_value(results):
+        lines.append(bad)
     lines += [f"Missing or incomplete: {what}." for what in results.missing_lines()]
     return "\n".join(lines) + "\n"
 
@@ -291,7 +309,8 @@ def draw(results: Results, out: Path, extra: Extra | None = None, share: float =
         paths += style.save(figure, [narrow], title, results.provenance())
         plt.close(figure)
     csv, text_path = stem.with_suffix(".csv"), stem.with_suffix(".caption.txt")
-    results.frame.to_csv(csv, index=False, lineterminator="\n")
+    words = {name: "category" for name in COLUMNS if name not in ("seed", "env_steps", "value")}
+    results.frame.astype(words).to_csv(csv, index=False, lineterminator="\n")  # a third of the time
     text_path.write_text(caption(results, share, extra))
     return [csv, *paths, text_path]
 

@@ -62,7 +62,7 @@ def latex(table: Sequence[Row], comment: str) -> str:
         comment: what stands behind the numbers, as the document's first line.
     """
     lines = [
-        f"% {comment}",
+        f"% {' '.join(comment.split())}",
         r"\documentclass{article}\usepackage{array,booktabs,longtable}\usepackage[margin=1cm,landscape]{geometry}",
         r"\begin{document}\scriptsize\setlength\tabcolsep{3pt}",
         rf"\begin{{longtable}}{{{columns(table)}}}\toprule",

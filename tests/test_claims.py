@@ -296,7 +296,7 @@ def test_a_run_folder_is_explained(tmp_path, capsys):
         f"needs: {tmp_path / 'ba9876543210'}",
         "preempted at iteration 3  by SIGINT",
         "return of the last iteration: 0.200",
-        "commit c0ffee and changes to it",
+        "commit c0ffee + changes",
         "in fig3 at scale smoke as ppo",
     ]
     for content in ("", "[]", json.dumps({"run_id": folder.name})):

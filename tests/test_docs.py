@@ -63,3 +63,10 @@ def test_every_page_is_reached_from_the_readme():
             place = (page.parent / target).resolve()
             todo += sorted(place.glob("*.md")) if place.is_dir() else [place]
     assert not [str(page.relative_to(ROOT)) for page in PAGES if page not in seen]
+
+
+def test_every_test_that_the_page_on_failures_names_exists():
+    named = re.findall(r"`(tests/\w+\.py)::(\w+)`", (ROOT / "docs/failures.md").read_text())
+    assert len(named) > 20
+    missing = [name for path, name in named if f"def {name}(" not in (ROOT / path).read_text()]
+    assert not missing

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from analysis.edition import Edition
-from experiments import costs, launchers, sweep, train
+from experiments import costs, launchers, status, sweep, train
 from experiments.config import COMMITTED, Run, compose_run
 from experiments.plan import Plan, committed_runs, make_plan
 from experiments.status import Status, read_status
@@ -244,11 +244,20 @@ def test_a_run_that_diverges_or_fails_says_so(tmp_path, monkeypatch, capsys):
     assert "Traceback" in capsys.readouterr().err
 
 
-def test_a_run_whose_heartbeat_stopped_is_lost(tmp_path):
-    (tmp_path / "status.json").write_text(json.dumps({"state": "running", "heartbeat": time.time() - 3600}))
-    assert read_status(tmp_path)["state"] == "lost"
-    (tmp_path / "status.json").write_text(json.dumps({"state": "running", "heartbeat": time.time()}))
-    assert read_status(tmp_path)["state"] == "running"
+def test_a_run_whose_heartbeat_stopped_is_lost_by_the_file_system_s_clock(tmp_path, monkeypatch):
+    path, now = tmp_path / "run" / "status.json", time.time()
+    path.parent.mkdir()
+    for ahead in (-3600.0, 0.0, 7200.0):  # what a host with a wrong clock wrote
+        path.write_text(json.dumps({"state": "running", "heartbeat": now + ahead}))
+        assert read_status(path.parent)["state"] == "running"
+        os.utime(path, (now - 100, now - 100))
+        assert read_status(path.parent)["state"] == "lost"
+    path.write_text(json.dumps({"state": "running", "heartbeat": now}))
+    for day in (-86400.0, 86400.0):  # by which our own clock is wrong
+        monkeypatch.setattr(time, "time", lambda day=day: now + day)
+        status._clock_ahead.cache_clear()
+        assert read_status(path.parent)["state"] == "running"
+    status._clock_ahead.cache_clear()
     assert read_status(tmp_path / "nowhere")["state"] == "missing"
 
 

@@ -139,7 +139,7 @@ def test_an_evaluation_depends_on_the_trained_run_of_another_figure(tmp_path):
     assert [run.kind for run in todo] == ["train", "evaluate"] * 2
     assert [run.env_steps for run in todo] == [400, 3 * 3 * 50] * 2  # the original and two changed environments
     todo[0].folder.mkdir()
-    Status(todo[0]).end("finished")
+    Status(todo[0]).end("finished", results={})
     assert [run.kind for run in plan("two", tmp_path).todo()] == ["evaluate", "train", "evaluate"]
 
 

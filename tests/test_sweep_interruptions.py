@@ -185,7 +185,7 @@ def test_a_lost_process_leaves_its_cause_unless_the_run_was_taken_over_or_is_don
     mark_lost(tiny_run, f"its process ended: {launchers.cause(-signal.SIGKILL)}")
     assert state() == "lost"
     assert read_status(tiny_run.folder)["message"] == "its process ended: SIGKILL"
-    Status(tiny_run).update(state="finished")
+    Status(tiny_run).update(state="finished", results={})
     mark_lost(tiny_run, "killed")
     assert state() == "finished"
 
@@ -213,20 +213,6 @@ def test_damaged_checkpoints_end_the_run_with_one_line_and_no_traceback(tiny_run
     assert "no intact checkpoint" in error
     assert "Traceback" not in error
     assert "no intact checkpoint" in read_status(tiny_run.folder)["message"]
-
-
-def test_resuming_under_another_commit_is_announced_and_both_commits_are_kept(tiny_run, capsys):
-    assert train.execute(tiny_run) == "finished"
-    path = tiny_run.folder / "manifest.json"
-    manifest = json.loads(path.read_text())
-    assert manifest["earlier_commits"] == []
-    path.write_text(json.dumps(manifest | {"git_commit": "0" * 40}))
-    Status(tiny_run).update(state="preempted")
-    assert train.execute(tiny_run) == "finished"
-    assert "last under 0000000000" in capsys.readouterr().out
-    resumed = json.loads(path.read_text())
-    assert resumed["earlier_commits"] == ["0" * 40]
-    assert resumed["git_commit"] == manifest["git_commit"]
 
 
 def test_a_run_whose_parent_was_preempted_is_preempted_too(tiny_run, monkeypatch):

@@ -6,12 +6,15 @@ File format: the 8 bytes of MAGIC, the SHA-256 of the rest (32 bytes), then what
 
 import hashlib
 import io
-import os
+import pickle
 import sys
 from pathlib import Path
 from typing import Any
 
 import torch
+
+from hippo.core.files import sync_folder, write_synced
+from hippo.core.log import RunLog
 
 MAGIC = b"HIPPO\x00\x01\n"
 DIGEST_BYTES = 32
@@ -35,20 +38,13 @@ def save(path: Path, state: dict[str, Any], previous: Path | None = None) -> Non
     payload = buffer.getvalue()
     temporary = path.with_name(path.name + ".tmp")  # what a kill leaves behind the next save overwrites
     try:
-        with temporary.open("wb") as file:
-            file.write(MAGIC + hashlib.sha256(payload).digest() + payload)
-            file.flush()
-            os.fsync(file.fileno())
+        write_synced(temporary, MAGIC + hashlib.sha256(payload).digest() + payload)
         if previous is not None and path.exists():
             path.replace(previous)
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
-    folder = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)
+    sync_folder(path.parent)
 
 
 def load(path: Path) -> dict[str, Any]:
@@ -56,7 +52,7 @@ def load(path: Path) -> dict[str, Any]:
 
     Raises:
         FileNotFoundError: there is no such file.
-        CheckpointError: the file is not a checkpoint, is truncated or has been altered.
+        CheckpointError: the file is not a checkpoint, is truncated or has been altered, or holds more than data.
     """
     data = path.read_bytes()
     start = len(MAGIC) + DIGEST_BYTES
@@ -65,45 +61,74 @@ def load(path: Path) -> dict[str, Any]:
     payload = data[start:]
     if hashlib.sha256(payload).digest() != data[len(MAGIC) : start]:
         raise CheckpointError(f"{path}: the content does not match its digest; the file is damaged")
-    return torch.load(io.BytesIO(payload), weights_only=True)
+    try:
+        content = torch.load(io.BytesIO(payload), weights_only=True)
+    except (pickle.UnpicklingError, RuntimeError, ValueError, EOFError, KeyError, AttributeError) as error:
+        raise CheckpointError(f"{path}: is no checkpoint ({' '.join(str(error).split())[:100]})") from None
+    if not isinstance(content, dict):
+        raise CheckpointError(f"{path}: is no checkpoint (it holds a {type(content).__name__})")
+    return content
 
 
 class Checkpoint:
-    """The two newest checkpoints of one run, `checkpoint.pt` and `checkpoint.prev.pt`, in its folder."""
+    """The two newest checkpoints of one run, `checkpoint.pt` and `checkpoint.prev.pt`, in its folder.
 
-    def __init__(self, folder: Path) -> None:
+    Args:
+        run_id: whose they are, noted in every checkpoint that is saved; one of another run is refused. "" asks nothing.
+        log: the run's log, whose digest is noted too; a checkpoint whose rows are not in it is not gone on from.
+    """
+
+    def __init__(self, folder: Path, run_id: str = "", log: RunLog | None = None) -> None:
         self.current = Path(folder) / "checkpoint.pt"
         self.previous = Path(folder) / "checkpoint.prev.pt"
+        self.run_id, self.log = run_id, log
 
     def save(self, state: dict[str, Any]) -> None:
         """Make `state` the newest checkpoint and keep the one before it."""
         save(self.current, state, self.previous)
 
     def load(self) -> dict[str, Any] | None:
-        """The newest intact checkpoint, None where there is none; a damaged one is named on stderr.
+        """The newest intact checkpoint that the log covers, None where there is none; those passed over are named.
 
         Raises:
-            CheckpointError: checkpoints exist and none of them is intact.
+            CheckpointError: checkpoints exist and none of them is intact, or one is of another run.
         """
         found = [path for path in (self.current, self.previous) if path.exists()]
+        intact = False
         for path in found:
             try:
-                return load(path)
+                state = load(path)
             except CheckpointError as error:
-                print(f"warning: {error}; trying the checkpoint before it", file=sys.stderr, flush=True)
-        if found:
+                _warn(f"{error}; trying the checkpoint before it")
+                continue
+            intact = True
+            if self.run_id and state.get("run_id", self.run_id) != self.run_id:
+                raise CheckpointError(
+                    f"{path}: is of run {state['run_id']}, not of {self.run_id}; delete or replace it"
+                )
+            if self.log is None or self.log.covers(state.get("iteration"), state.get("log")):
+                return state
+            _warn(f"{path}: {self.log.path} does not hold the rows up to its iteration {state.get('iteration')}")
+        if found and not intact:
             raise CheckpointError(f"{self.current.parent}: no intact checkpoint; delete the folder to start again")
+        if found:
+            _warn(f"{self.current.parent}: training starts again at iteration 0")
         return None
 
     def record(self, iteration: int, **parts: Any) -> None:
         """Save the `state_dict` of every part (network, optimiser) as of the end of `iteration`."""
-        self.save({"iteration": iteration, **{name: part.state_dict() for name, part in parts.items()}})
+        state: dict[str, Any] = {"iteration": iteration}
+        if self.run_id:
+            state["run_id"] = self.run_id
+        if self.log is not None:
+            state["log"] = self.log.digest
+        self.save(state | {name: part.state_dict() for name, part in parts.items()})
 
     def restore(self, **parts: Any) -> int:
         """Load what `record` saved into `parts`; returns the iteration to go on with, 0 for a fresh start.
 
         Raises:
-            CheckpointError: the checkpoint is of other networks or settings than `parts`.
+            CheckpointError: the checkpoint is of another run, or of other networks or settings than `parts`.
         """
         state = self.load()
         if state is None:
@@ -111,7 +136,13 @@ class Checkpoint:
         for name, part in parts.items():
             try:
                 part.load_state_dict(state[name])
-            except (KeyError, RuntimeError, ValueError) as error:
+            except (KeyError, IndexError, AttributeError, TypeError, RuntimeError, ValueError) as error:
                 what = " ".join(str(error).split())[:200]
                 raise CheckpointError(f"{self.current}: not of this run's settings: {name}: {what}") from error
+        if not isinstance(state.get("iteration"), int):
+            raise CheckpointError(f"{self.current}: does not say its iteration")
         return state["iteration"] + 1
+
+
+def _warn(message: str) -> None:
+    print(f"warning: {message}", file=sys.stderr, flush=True)

@@ -22,7 +22,7 @@ from hippo.core.on_policy import OnPolicyConfig
 from hippo.core.policies import POLICY_HEAD, Manager, SkillPolicy, gaussian_entropy, sample_categorical
 from hippo.core.ppo import Level, Rows
 from hippo.core.rollout import Steps
-from hippo.core.settings import ConfigError, setting
+from hippo.core.settings import MOST_SKILLS, WIDEST, ConfigError, setting
 
 
 @dataclass
@@ -32,7 +32,9 @@ class HierarchyConfig(OnPolicyConfig):
     The defaults are the paper's and, where it is silent, the authors' code's.
     """
 
-    num_skills: int = setting(6, "number of skills n", paper="6 (App. A)", code="6 (pg_test.py:332)", low=1)
+    num_skills: int = setting(
+        6, "number of skills n", paper="6 (App. A)", code="6 (pg_test.py:332)", low=1, high=MOST_SKILLS
+    )
     period_min: int = setting(
         5, "shortest commitment in steps; equal to period_max: a fixed period", paper="5 (App. A)", low=1
     )
@@ -56,8 +58,12 @@ class HierarchyConfig(OnPolicyConfig):
         code="step (hippo2.py:186)",
         choices=("step", "smdp"),
     )
-    manager_hidden_sizes: list[int] = setting([32, 32], "manager's hidden layers", paper="2 x 32 (App. A)", low=1)
-    skill_hidden_sizes: list[int] = setting([64, 64], "skill network's hidden layers", paper="2 x 64 (App. A)", low=1)
+    manager_hidden_sizes: list[int] = setting(
+        [32, 32], "manager's hidden layers", paper="2 x 32 (App. A)", low=1, high=WIDEST
+    )
+    skill_hidden_sizes: list[int] = setting(
+        [64, 64], "skill network's hidden layers", paper="2 x 64 (App. A)", low=1, high=WIDEST
+    )
     skill_integration: str = setting(
         "bilinear",
         "how the skill enters the skill network",

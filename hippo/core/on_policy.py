@@ -18,7 +18,7 @@ from hippo.core.direct import SquaredError
 from hippo.core.minibatch import minibatches
 from hippo.core.normalize import ObservationFilter
 from hippo.core.ppo import Level, in_chunks, maximize
-from hippo.core.settings import ConfigError, check, setting
+from hippo.core.settings import MOST_STEPS, WIDEST, ConfigError, check, setting
 
 ADAM_EPSILON = 1e-5  # of the minibatches' Adam (OpenAI Baselines)
 
@@ -29,7 +29,11 @@ class OnPolicyConfig:
 
     iterations: int = setting(dataclasses.MISSING, "training iterations", code="2000 on Gather (README)", low=1)
     batch_size: int = setting(
-        dataclasses.MISSING, "environment steps per iteration", paper="Block 50 000, Gather 100 000 (App. A)", low=1
+        dataclasses.MISSING,
+        "environment steps per iteration",
+        paper="Block 50 000, Gather 100 000 (App. A)",
+        low=1,
+        high=MOST_STEPS,
     )
     horizon: int = setting(
         dataclasses.MISSING, "episode length H in steps", paper="Block 1000, Ant 5000, Snake 8000 (App. A)", low=1
@@ -46,7 +50,9 @@ class OnPolicyConfig:
         paper="finite-horizon MDP (section 2)",
         code="no (hier_base.py:57)",
     )
-    value_hidden_sizes: list[int] = setting([32, 32], "hidden layers of the baselines", paper="2 x 32 (App. A)", low=1)
+    value_hidden_sizes: list[int] = setting(
+        [32, 32], "hidden layers of the baselines", paper="2 x 32 (App. A)", low=1, high=WIDEST
+    )
     value_iterations: int = setting(
         10,
         "the most loss evaluations that the fit of a baseline may use per iteration",

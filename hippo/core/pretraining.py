@@ -21,7 +21,7 @@ from hippo.core.normalize import standardize
 from hippo.core.policies import SkillPolicy, gaussian_entropy
 from hippo.core.ppo import Level, Rows, maximize
 from hippo.core.rollout import LastInfo, Steps
-from hippo.core.settings import ConfigError, check, setting
+from hippo.core.settings import MOST_SKILLS, MOST_STEPS, WIDEST, ConfigError, check, setting
 from hippo.core.value import ValueFunction, explained_variance
 
 
@@ -33,13 +33,21 @@ class PretrainingConfig:
         dataclasses.MISSING, "training iterations", code="1000 (train_snn_ant.py:151); DIAYN: not in code", low=1
     )
     batch_size: int = setting(
-        dataclasses.MISSING, "environment steps per iteration", code="50 000 (train_snn_ant.py:149)", low=1
+        dataclasses.MISSING,
+        "environment steps per iteration",
+        code="50 000 (train_snn_ant.py:149)",
+        low=1,
+        high=MOST_STEPS,
     )
     horizon: int = setting(
         dataclasses.MISSING, "steps of a path", code="SNN: 400 (train_snn_ant.py:44); DIAYN: 1000 (its paper)", low=1
     )
-    num_skills: int = setting(6, "number of skills", paper="6 (App. A)", code="6 (train_snn_ant.py)", low=1)
-    skill_hidden_sizes: list[int] = setting([64, 64], "skill network's hidden layers", paper="2 x 64 (App. A)", low=1)
+    num_skills: int = setting(
+        6, "number of skills", paper="6 (App. A)", code="6 (train_snn_ant.py)", low=1, high=MOST_SKILLS
+    )
+    skill_hidden_sizes: list[int] = setting(
+        [64, 64], "skill network's hidden layers", paper="2 x 64 (App. A)", low=1, high=WIDEST
+    )
     skill_integration: str = setting(
         "bilinear",
         "how the skill enters the skill network",
@@ -59,7 +67,9 @@ class PretrainingConfig:
     bootstrap_horizon: bool = setting(
         True, "whether the end of the horizon bootstraps the value", code="DIAYN: yes, time-outs are not terminal"
     )
-    value_hidden_sizes: list[int] = setting([32, 32], "hidden layers of the baseline V(s, z)", ours="HiPPO's", low=1)
+    value_hidden_sizes: list[int] = setting(
+        [32, 32], "hidden layers of the baseline V(s, z)", ours="HiPPO's", low=1, high=WIDEST
+    )
     value_iterations: int = setting(10, "the most loss evaluations of a fit of the baseline", ours="HiPPO's", low=1)
 
     def __post_init__(self) -> None:

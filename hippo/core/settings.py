@@ -8,6 +8,9 @@ import dataclasses
 import math
 from typing import Any
 
+# Upper bounds of what memory is asked for, far above anything that is trained here.
+MOST_STEPS, MOST_SKILLS, WIDEST = 10_000_000, 1000, 10_000  # of a batch or a buffer; of a policy; units of a layer
+
 
 class ConfigError(ValueError):
     """A setting has a value that cannot work; the message names the key, the value and the valid choices."""

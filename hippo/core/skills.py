@@ -72,6 +72,8 @@ def read_skills(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
         raise SkillsError(f"skills={path}: {error}") from error
     except KeyError as error:
         raise SkillsError(f"skills={path}: not a skills file, it has no {error}") from error
+    except (TypeError, AttributeError) as error:
+        raise SkillsError(f"skills={path}: not a skills file ({error})") from error
 
 
 def policy_of(path: Path) -> tuple[SkillPolicy, dict[str, Any]]:
@@ -115,7 +117,10 @@ def load_skills(path: Path, policy: SkillPolicy, robot: str, observation: str) -
     if inputs > metadata["obs_size"]:
         weight = with_blind_input(tensors["first.weight"], metadata["obs_size"], policy.num_skills)
         tensors = tensors | {"first.weight": weight}
-    policy.load_state_dict(tensors)
+    try:
+        policy.load_state_dict(tensors)
+    except (RuntimeError, TypeError, AttributeError) as error:
+        raise SkillsError(f"skills={path}: its tensors do not fit ({' '.join(str(error).split())[:200]})") from error
     return metadata
 
 

@@ -1,5 +1,7 @@
 """The environments: numpy, MuJoCo and Gymnasium, no learning library."""
 
+import hippo.envs.surroundings  # noqa: F401, I001  before MuJoCo is imported
+
 from hippo.envs.registration import ENVIRONMENTS, gymnasium_id, make, register
 
 __all__ = ["ENVIRONMENTS", "gymnasium_id", "make"]

@@ -47,7 +47,9 @@ def open_gl() -> str:
         NoOpenGL: neither does.
     """
     wanted = os.environ.get("MUJOCO_GL")
-    for name in [wanted] if wanted else ["egl", "osmesa"]:
+    with_display = "DISPLAY" in os.environ or "WAYLAND_DISPLAY" in os.environ
+    valid = ["egl", "osmesa", *(["glfw"] if with_display else [])]  # without one, glfw ends the process
+    for name in [name for name in valid if name == (wanted or name)]:
         try:
             context = importlib.import_module(f"mujoco.{name}").GLContext(64, 64)
         except (ImportError, AttributeError, RuntimeError, OSError):
