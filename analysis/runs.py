@@ -23,7 +23,7 @@ from hippo.core.results import damage
 NAME, LABEL = re.compile(r"\w[\w.-]*"), re.compile(r"[^\x00-\x1f\x7f-\x9f]*")
 COLUMN = re.compile(r"\w[\w.:/-]*")  # of progress.csv; nothing that a spreadsheet takes for a formula
 # What names in a plan may be: they become names of files, cells of tables and lines on a terminal.
-PATTERNS = {"run_id": re.compile("[0-9a-f]{12}"), "env": NAME, "variant": NAME, "kind": NAME, "physics": NAME}
+PATTERNS = {"run_id": re.compile(r"[0-9A-Za-z_]{1,64}"), "env": NAME, "variant": NAME, "kind": NAME, "physics": NAME}
 PATTERNS |= dict.fromkeys(("env_label", "variant_label", "state"), LABEL)
 PLAN: dict[str, type | tuple[type, ...]] = {"figure": str, "scale": str, "title": str, "runs": list}
 PLANNED: dict[str, type | tuple[type, ...]] = {
@@ -244,7 +244,7 @@ def read_progress(path: Path, metrics: Sequence[str] | None) -> pd.DataFrame:
         raise DamagedFile(f"{path}: is no progress.csv ({' '.join(str(error).split())[:100]})") from None
     if strange := [name for name in columns if not COLUMN.fullmatch(name)]:
         raise DamagedFile(f"{path}: is no progress.csv (a column {strange[0]!r:.60})")
-    if words := [name for name in table if not pd.api.types.is_numeric_dtype(table[name])]:
+    if words := [name for name in table if len(table) and not pd.api.types.is_numeric_dtype(table[name])]:
         raise DamagedFile(f"{path}: is no progress.csv ({', '.join(map(str, words))}: not only numbers)")
     return table.melt(id_vars="env_steps", value_vars=columns, var_name="metric")
 

@@ -259,6 +259,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return ACTIONS[options.action](options, plan_of)
     except ConfigError as error:
         return bad_input(error)
+    except BrokenPipeError:
+        raise
     except OSError as error:  # of a file system without locks, too
         print(f"error: {error}", file=sys.stderr)
         return EXIT_FAILED

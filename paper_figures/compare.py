@@ -17,7 +17,7 @@ import pandas as pd
 import yaml
 
 from analysis.edition import PAPER, Edition
-from analysis.runs import COLUMNS, Results, read_commits, read_progress
+from analysis.runs import COLUMNS, PATTERNS, Results, altered, read_commits, read_progress
 from paper_figures import curves
 from paper_figures.command_line import BAD_INPUT, HERE, SMOOTH, share
 
@@ -31,11 +31,16 @@ def planned(folder: Path) -> dict[str, Any]:
     try:
         manifest = json.loads((folder / "manifest.json").read_text())
         identity, config = manifest["identity"], yaml.safe_load(manifest["config"])
-    except (OSError, ValueError, KeyError) as error:
+        own = identity["settings"] | identity["options"]
+        named = all(
+            PATTERNS[key].fullmatch(name) for key, name in (("run_id", manifest["run_id"]), ("env", identity["env"]))
+        )
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, yaml.YAMLError) as error:
         raise ValueError(f"{folder}: is no run folder ({type(error).__name__})") from error
+    if not named:
+        raise ValueError(f"{folder}: its manifest.json names no run")
     if config["kind"] != "train":
         raise ValueError(f"{folder}: is a run of kind {config['kind']}; only training runs are compared")
-    own = identity["settings"] | identity["options"]
     label = " ".join([identity["algo"], *(f"{key}={value}" for key, value in own.items())])
     budget = {key: identity[key] for key in ("env", "seed", "iterations", "batch_size")}
     labels = {"env_label": identity["env"].replace("_", " ").title(), "variant": label, "variant_label": label}
@@ -61,7 +66,10 @@ def gather(folders: Sequence[Path]) -> Results:
     edition = {key: next(iter(runs.values()))[key] for key in ("scale", "protocol")}
     parts, missing = [], []
     for run in runs.values():
-        rows = read_progress(run.pop("folder") / "progress.csv", ["return_mean"])
+        folder = run.pop("folder")
+        rows = read_progress(folder / "progress.csv", ["return_mean"])
+        if wrong := altered(folder):
+            rows, run["state"] = rows[:0], wrong
         if len(rows) < run["iterations"]:
             missing.append(run)
         parts.append(rows.assign(figure="compare", **{key: run[key] for key in ("scale", *COLUMNS[2:6])}))

@@ -24,7 +24,7 @@ from analysis.edition import PAPER, Edition
 from analysis.runs import COLUMNS, Results, scores
 from paper_figures import command_line, style
 
-MOST_POINTS = 4000  # of a curve that are drawn, several for every pixel
+MOST_POINTS = 2000  # of a curve that are drawn, several for every pixel
 SHORTER = 0.95  # methods whose budget is below this share of the longest have their last value held
 EDGE = withStroke(linewidth=2.6, foreground="white")  # tells lines that cross or touch apart
 NOT_A_RESULT = {"smoke": "smoke"}  # scales whose pictures say nothing about the methods

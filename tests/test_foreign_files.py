@@ -350,7 +350,7 @@ def test_a_file_system_without_locks_is_one_line(number, tmp_path, monkeypatch):
 def test_temporary_files_of_killed_processes_are_removed_at_the_next_start(tiny, tmp_path):
     place = tmp_path / "plans/smoke"
     place.mkdir(parents=True)
-    left, ours, fresh = (place / f"tiny.json.{pid}.tmp" for pid in (2**22 + 1, os.getpid(), 2**22 + 2))
+    left, ours, fresh = (place / f"tiny.json.{pid}.tmp" for pid in (2**22 + 1, os.getppid(), 2**22 + 2))
     (tmp_path / "code-1.4194305.tmp").mkdir()
     for path in (left, ours, fresh, tmp_path / "code-1.4194305.tmp"):
         path.exists() or path.write_text("")

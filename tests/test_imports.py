@@ -18,6 +18,9 @@ FORBIDDEN = {
 }
 ALLOWED = {
     "paper_figures/fig2.py": ("hippo.envs",),  # the picture of the environments renders them
+    # What a file must hold, and whether it still does, is said once; neither knows torch.
+    "analysis/runs.py": ("hippo.core.files", "hippo.core.results"),
+    "analysis/explain.py": ("hippo.core.files",),
     "experiments/plan.py": ("analysis.edition",),  # where plans lie is agreed on once
 }
 

@@ -226,7 +226,7 @@ def test_soft_locks_stand_in_where_they_are_asked_for(no_locks, tiny_run, monkey
     tiny_run.folder.mkdir()
     with locked(tiny_run.folder / ".lock"):
         assert train.execute(tiny_run) == "running"
-        assert f"if it is not, delete {tiny_run.folder / '.lock.soft'}" in capsys.readouterr().out
+        assert f"If it is gone, delete {tiny_run.folder / '.lock.soft'}" in capsys.readouterr().out
         status.mark_lost(tiny_run, "killed")
         assert read_status(tiny_run.folder)["state"] == "missing"
     assert train.execute(tiny_run) == "finished"

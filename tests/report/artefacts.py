@@ -26,7 +26,7 @@ def picture(path: Path, title: str, runs: tuple[str, ...] = (), size: tuple[int,
 def planned(run_id: str, seed: int, state: str = "finished", label: str = "HiPPO random p") -> dict:
     """A run as it stands in a plan."""
     labels = {"env": "ant_gather", "env_label": "Ant Gather", "variant": "hippo_random", "variant_label": label}
-    rest = {"iterations": 2, "physics": "paper", "kind": "train", "ancestors": [], "state": state}
+    rest = {"iterations": 2, "batch_size": 10, "physics": "paper", "kind": "train", "ancestors": [], "state": state}
     return {"run_id": run_id, "seed": seed} | labels | rest
 
 
