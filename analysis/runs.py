@@ -80,7 +80,8 @@ class Results:
     def seeds_with_return(self) -> dict[tuple[str, str], int]:
         """Number of seeds that have a learning curve, by environment and method."""
         rows = self.frame[self.frame["metric"] == "return_mean"]
-        return {(str(e), str(v)): int(n) for (e, v), n in rows.groupby(["env", "variant"])["seed"].nunique().items()}
+        counts = rows.groupby(["env", "variant"])["seed"].nunique().reset_index()
+        return {(env, variant): int(n) for env, variant, n in counts.itertuples(index=False)}
 
     def missing_lines(self) -> list[str]:
         """`missing` in words: a line per environment, and per seeds and state where these differ."""

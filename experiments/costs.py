@@ -69,7 +69,12 @@ def known() -> dict[str, Any]:
 
 def _is_cost(entry: Any) -> bool:
     """Whether an entry of the file is a `Cost`."""
-    kinds = {"seconds_per_step": (float, int), "checkpoint_bytes": int, "row_bytes": int, "measured": str}
+    kinds: dict[str, Any] = {
+        "seconds_per_step": (float, int),
+        "checkpoint_bytes": int,
+        "row_bytes": int,
+        "measured": str,
+    }
     return (
         isinstance(entry, dict)
         and entry.keys() == kinds.keys()

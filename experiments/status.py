@@ -220,7 +220,8 @@ def read_status(folder: Path) -> dict[str, Any]:
         return {"state": "missing", "iteration": -1, "message": ""}
     except (DamagedFile, OSError):  # a power cut; the checkpoint has its own digest
         return {"state": "lost", "iteration": -1, "message": "status.json is damaged"}
-    status = {"iteration": -1, "message": ""} | status
+    defaults: dict[str, Any] = {"iteration": -1, "message": ""}
+    status = defaults | status
     if status["state"] == "running" and silence(path) > LOST_AFTER_SECONDS:
         status |= {"state": "lost", "message": status["message"] or "its heartbeat stopped"}
     if status["state"] == "finished" and (wrong := damage(folder, status.get("iterations", 1), status.get("results"))):

@@ -305,3 +305,15 @@ def test_a_full_disk_fails_the_run_clearly_and_it_goes_on_once_there_is_space(
     monkeypatch.setattr(train.Checkpoint, "save", save)
     assert train.execute(run) == "finished"
     assert (run.folder / "progress.csv").read_bytes() == (reference.folder / "progress.csv").read_bytes()
+
+
+@pytest.mark.slow
+def test_a_full_disk_under_a_sweep_stops_the_launching_and_the_same_command_goes_on(small_disk, capsys):
+    runs = [compose_run([*TINY, "iterations=1", f"seed={seed}"], small_disk) for seed in range(2)]
+    free = os.statvfs(small_disk)
+    (small_disk / "ballast").write_bytes(bytes(free.f_bavail * free.f_bsize))
+    states = launchers.run_locally(runs, 1, lambda *_: None)
+    assert list(states.values()) == ["failed", "missing"]
+    assert f"no space left on the disk of {small_disk}: 1 runs are not started" in capsys.readouterr().err
+    (small_disk / "ballast").unlink()
+    assert set(launchers.run_locally(runs, 1, lambda *_: None).values()) == {"finished"}

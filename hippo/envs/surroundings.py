@@ -7,7 +7,7 @@ import os
 import tempfile
 from pathlib import Path
 
-import numba
+from numba import config
 
 
 def import_mujoco_without_opengl() -> None:
@@ -28,7 +28,8 @@ def place_for_kernels(source: Path) -> str:
     Args:
         source: the folder of the code, beside which numba keeps them where it can.
     """
-    if numba.config.CACHE_DIR or _takes_files(source / "__pycache__") or _takes_files(Path("~/.cache").expanduser()):
+    chosen: str = config.CACHE_DIR  # type: ignore[attr-defined]
+    if chosen or _takes_files(source / "__pycache__") or _takes_files(Path("~/.cache").expanduser()):
         return ""
     return tempfile.mkdtemp(prefix="hippo-kernels-")
 
@@ -44,4 +45,4 @@ def _takes_files(folder: Path) -> bool:
 
 import_mujoco_without_opengl()
 if place := place_for_kernels(Path(__file__).parent):
-    numba.config.CACHE_DIR = place
+    config.CACHE_DIR = place  # type: ignore[attr-defined]
