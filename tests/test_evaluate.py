@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from baselines import ppo
-from experiments import evaluate, export, train, video
+from experiments import crossings, evaluate, export, train, video
 from experiments.config import compose_run
 from hippo.core.episodes import opening_episodes
 from hippo.core.hierarchy import HierarchicalPolicy, collect
@@ -49,6 +49,20 @@ def test_evaluation_repeats_itself_and_leaves_the_run_alone(algo, trained):
     assert {p.name: p.read_bytes() for p in run.folder.iterdir()} == before
     assert len(first) == 6
     assert {row["length"] for row in first} == {40}
+
+
+def test_on_block_tasks_a_row_says_how_walls_were_crossed_and_elsewhere_it_does_not(trained, tmp_path, capsys):
+    budget = ["iterations=1", "batch_size=400", "env.horizon=40", f"runs_dir={tmp_path}"]
+    run = compose_run(["env=block_half_cheetah", "algo=ppo", "scale=smoke", *budget])
+    assert train.execute(run) == "finished"
+    capsys.readouterr()
+    assert evaluate.main([str(run.folder), "--episodes", "3", "--csv"]) == 0
+    rows = list(csv.DictReader(capsys.readouterr().out.splitlines()))
+    assert tuple(rows[0]) == (*evaluate.COLUMNS, *crossings.COLUMNS)
+    assert [float(row["return"]) for row in rows] == [float(row["crossings"]) for row in rows]
+    assert evaluate.main([str(run.folder), "--episodes", "3"]) == 0
+    assert "cleared" in capsys.readouterr().out.splitlines()[-1]
+    assert evaluate.evaluate(trained["ppo"], 2, seed=0)[0].keys() == set(evaluate.COLUMNS)
 
 
 def test_changed_dynamics_meet_the_same_episodes(trained):
