@@ -9,11 +9,9 @@ were, but for the one group that k cuts.
 """
 
 import io
-import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import pandas as pd
 
@@ -21,8 +19,10 @@ from analysis.command_line import parser
 from analysis.edition import chosen
 from analysis.runs import COLUMNS, MissingData, Results, load, read_committed
 from experiments.command_line import bad_input, run_command
+from experiments.manifest import SCHEMA, earlier_of
 from experiments.plan import make_plan
 from experiments.status import write_atomically
+from hippo.core.files import read_json
 from hippo.core.settings import ConfigError
 
 MOST_ROWS = 250
@@ -38,10 +38,12 @@ def thinned(rows: pd.DataFrame) -> pd.DataFrame:
     return rows.groupby(group).agg(others | {"value": "mean"})
 
 
-def origin(folder: Path) -> dict[str, Any]:
-    """Where a run comes from, by its manifest."""
-    manifest = json.loads((folder / "manifest.json").read_text())
-    return {"run_id": folder.name} | {key: manifest.get(key) for key in ORIGIN}
+def origin(folder: Path) -> dict[str, str]:
+    """Where a run comes from, by its manifest; of one that went on under other conditions, all of them in turn."""
+    manifest = read_json(folder / "manifest.json", SCHEMA)
+    stretches = [*earlier_of(manifest), manifest]
+    values = {key: [str(stretch.get(key) or "") for stretch in stretches] for key in ORIGIN}
+    return {"run_id": folder.name} | {key: " then ".join(dict.fromkeys(of)) for key, of in values.items()}
 
 
 def as_csv(table: pd.DataFrame) -> str:

@@ -22,7 +22,8 @@ def finished(tmp_path, lengths, iterations):
             "cpu": "A, B",
             "cpu_flags": "no",
         }
-        (tmp_path / f"{seed:012x}/manifest.json").write_text(json.dumps(origin))
+        name = {"run_id": f"{seed:012x}", "identity": {}, "earlier": [origin | {"git_commit": "c0de"}]}
+        (tmp_path / f"{seed:012x}/manifest.json").write_text(json.dumps(origin | name))
 
 
 def committed(tmp_path):
@@ -52,7 +53,7 @@ def test_whole_runs_are_committed_once_with_their_origin(tmp_path):
     assert (rows["metric"] == "return_mean").all()
     assert rows["value"].tolist() == [0.0, 0.1, 0.2]
     assert path.with_suffix(".runs.csv").read_text() == (
-        'run_id,git_commit,git_difference,lock,cpu,cpu_capability\n000000000000,c0ffee0,,10c,"A, B",\n'
+        'run_id,git_commit,git_difference,lock,cpu,cpu_capability\n000000000000,c0de then c0ffee0,,10c,"A, B",\n'
     )
     assert committed(tmp_path) == (1, 0)
     assert path.read_bytes() == before
