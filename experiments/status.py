@@ -224,7 +224,7 @@ def read_status(folder: Path) -> dict[str, Any]:
     status = defaults | status
     if status["state"] == "running" and silence(path) > LOST_AFTER_SECONDS:
         status |= {"state": "lost", "message": status["message"] or "its heartbeat stopped"}
-    if status["state"] == "finished" and (wrong := damage(folder, status.get("iterations", 1), status.get("results"))):
+    if status["state"] == "finished" and (wrong := damage(folder, status.get("iterations", 0), status.get("results"))):
         status |= {"state": "lost", "message": f"{wrong}; the same command trains what is missing"}
     return status
 

@@ -37,7 +37,7 @@ def damage(folder: Path, iterations: int, stated: Any) -> str:
 
     Args:
         stated: their `digests` as they were when it finished; None of a run by older code, of which only the rows of
-            progress.csv are counted: `iterations`, or the one of a measurement.
+            progress.csv are counted: `iterations` (0: any number), or the one of a measurement.
     """
     if isinstance(stated, dict):
         wrong = [name for name, digest in stated.items() if name in RESULT_FILES and _digest(folder / name) != digest]
@@ -47,8 +47,8 @@ def damage(folder: Path, iterations: int, stated: Any) -> str:
         return "" if (folder / "episodes.csv").exists() else "progress.csv is not there"
     rows = len(rows_of(path)) - 1
     lines = path.read_bytes().count(b"\n") - 1
-    wanted = iterations if (folder / "checkpoint.pt").exists() else 1
-    return "" if rows == lines and rows in (iterations, wanted) else f"progress.csv holds {rows} rows of {iterations}"
+    wanted = {iterations or rows, iterations if (folder / "checkpoint.pt").exists() else 1}
+    return "" if rows == lines and rows in wanted else f"progress.csv holds {rows} rows of {iterations}"
 
 
 def _digest(path: Path) -> str:
