@@ -22,6 +22,8 @@ ALLOWED = {
     "analysis/runs.py": ("hippo.core.files", "hippo.core.results"),
     "analysis/explain.py": ("hippo.core.files",),
     "experiments/plan.py": ("analysis.edition",),  # where plans lie is agreed on once
+    "experiments/commit.py": ("analysis",),  # from run folders to committed rows
+    "experiments/study.py": ("analysis", "paper_figures"),  # from a file of runs to their page
 }
 
 
