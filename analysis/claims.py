@@ -162,11 +162,11 @@ def lines(scale: str, runs_dir: Path, data_dir: Path, protocol: str = PAPER) -> 
     out = [
         SMOKE if smoke else tally(rulings),
         "",
-        "| claim | where | sentence | verdict | differences [90 % interval] | the paper's own numbers |",
-        "|---|---|---|---|---|---|",
+        "| claim | where | sentence | verdict | why | differences [90 % interval] | the paper's own numbers |",
+        "|---|---|---|---|---|---|---|",
     ]
     for claim, ruling in zip(CLAIMS, rulings, strict=True):
-        words = (verdict_of(ruling), in_words(ruling), own_numbers(claim, paper))
+        words = (ruling.verdict, ruling.why, in_words(ruling), own_numbers(claim, paper))
         out.append(f"| {' | '.join((claim.name, claim.source, claim.sentence, *words))} |")
     return [*out, "", "The rule and its error rates: docs/verdicts.md."]
 

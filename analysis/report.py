@@ -24,7 +24,7 @@ from analysis.runs import MissingData
 
 HERE = Path(__file__).parent
 RUN_COLUMNS = ("run", "algorithm", "method", "seed", "state", "commit", "lock", "core-s", "physics", "used in")
-VERDICTS = {"reproduced": "good", "not reproduced": "bad", "inconclusive at this budget": "open"}
+VERDICTS = {"reproduced": "good", "not reproduced": "bad", "inconclusive": "open", "undecidable here": "open"}
 UNKNOWN = "-"
 MARKUP = re.compile(r"([\\`*_\[\]|~$@]|:(?=//)|(?<=www)\.)")  # the last three make links of bare addresses
 OPENING = re.compile(r"^(\d*)(?=[-+#=.)]+(\s|$))")  # of a line, which makes it a list, a heading or a rule

@@ -234,11 +234,11 @@ def test_an_artefact_of_other_runs_says_so(tmp_path):
 
 def test_each_verdict_has_its_own_look_and_smoke_has_none(tmp_path):
     artefacts.picture(tmp_path / "out/smoke/fig3.png", "fig3: A title")
-    artefacts.claims(tmp_path, ("reproduced", "not reproduced", "inconclusive at this budget", "no data"))
+    artefacts.claims(tmp_path, ("reproduced", "not reproduced", "inconclusive", "no data"))
     html, _ = pages(tmp_path)
     looks = dict(re.findall(r'<span class="badge (\w*)">([^<]*)</span>', html))
     assert looks == {
-        "good": "reproduced", "bad": "not reproduced", "open": "inconclusive at this budget", "": "no data"
+        "good": "reproduced", "bad": "not reproduced", "open": "inconclusive", "": "no data"
     }  # fmt: skip
     artefacts.claims(tmp_path, ("smoke: no verdicts",) * 3)
     html, _ = pages(tmp_path)

@@ -68,10 +68,11 @@ def table(root: Path, name: str, rows: list[str], header: str = "method | return
 
 def claims(root: Path, verdicts: tuple[str, ...] = ("reproduced", "not reproduced")) -> None:
     """claims.md as analysis.claims writes it."""
-    columns = ("claim", "where", "sentence", "verdict", "differences [interval]", "the paper's own numbers")
-    head = f"| {' | '.join(columns)} |\n|---|---|---|---|---|---|\n"
+    columns = ("claim", "where", "sentence", "verdict", "why", "differences [90 % interval]", "the paper's own numbers")
+    head = f"| {' | '.join(columns)} |\n|---|---|---|---|---|---|---|\n"
     rows = "".join(
-        f"| name_{i} | section 5 | {ATTACK} | {verdict} | ant +1 [0, 2] | |\n" for i, verdict in enumerate(verdicts)
+        f"| name_{i} | section 5 | {ATTACK} | {verdict} | because | ant +1 [0, 2] | |\n"
+        for i, verdict in enumerate(verdicts)
     )
     path = root / "out/smoke/claims.md"
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -93,5 +94,5 @@ def hostile(root: Path) -> list[str]:
     picture(root / "out/smoke/gallery.png", BREAKOUT)
     wide = ["a very long name of a method that does not fit", *(["0.123 ± 0.045"] * 14)]
     table(root, "table1", [f"**{ATTACK}** | 1.0" + " | x" * 13, " | ".join(wide)], " | ".join("abcdefghijklmno"))
-    claims(root, ("reproduced", "not reproduced", "inconclusive at this budget", BREAKOUT))
+    claims(root, ("reproduced", "not reproduced", "inconclusive", BREAKOUT))
     return ["--runs-dir", str(root / "runs"), "--out", str(root / "out")]
