@@ -96,7 +96,7 @@ def ruled(claim: Claim, results: Results | None, paper: dict[str, Any]) -> Rulin
     if results is None:
         return Ruling(NO_DATA, "", {})
     ruling = judge(claim, results)
-    return ruling if ruling.comparisons else Ruling(NO_DATA, ruling.why, {})
+    return ruling if ruling.comparisons else Ruling(NO_DATA, f"fewer than {FEWEST_SEEDS} seeds everywhere", {})
 
 
 def in_words(ruling: Ruling) -> str:
