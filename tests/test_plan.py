@@ -313,7 +313,9 @@ def test_a_full_disk_under_a_sweep_stops_the_launching_and_the_same_command_goes
     free = os.statvfs(small_disk)
     (small_disk / "ballast").write_bytes(bytes(free.f_bavail * free.f_bsize))
     states = launchers.run_locally(runs, 1, lambda *_: None)
-    assert list(states.values()) == ["failed", "missing"]
+    first, second = states.values()
+    assert first in ("failed", "lost")  # on a full disk its process may not even be able to say so
+    assert second == "missing"
     assert f"no space left on the disk of {small_disk}: 1 runs are not started" in capsys.readouterr().err
     (small_disk / "ballast").unlink()
     assert set(launchers.run_locally(runs, 1, lambda *_: None).values()) == {"finished"}
