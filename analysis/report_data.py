@@ -14,7 +14,7 @@ from PIL import Image
 
 from analysis import explain
 from analysis.edition import OVERRIDDEN, Edition
-from analysis.runs import MissingData, check_edition, code_of, stretches
+from analysis.runs import MissingData, check_edition, check_figure, code_of, stretches
 
 ROOT = Path(__file__).parent.parent
 LEDGER = ROOT / "docs" / "hyperparameters.csv"
@@ -169,8 +169,7 @@ def read_plans(plans_dir: Path, edition: Edition) -> dict[str, dict[str, Any]]:
         if missing:
             raise ValueError(f"{path}: is no plan, it lacks {', '.join(sorted(missing))}")
         check_edition(path, plan, edition)
-        if plan["figure"] != path.stem:
-            raise ValueError(f"{path}: figure must be {path.stem}, is {plan['figure']!r:.60}")
+        check_figure(path, plan)
         plans[path.stem] = plan
     return plans
 

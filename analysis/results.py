@@ -48,8 +48,8 @@ def performance(results: Results, env: str) -> list[str]:
         final = np.array([stats.final_performance(curve) for curve in curves])
         gain = final - [stats.final_performance(curve[::-1]) for curve in curves]
         area = np.array([curve.mean() for curve in curves])
-        cells = [f"{x.mean():.2f}" + (f" ± {x.std(ddof=1):.2f}" if len(seeds) > 1 else "") for x in (final, gain, area)]
-        row = f"| {label[variant]} | {len(seeds)} | {steps[-1] / 1e6:.1f} M | {' | '.join(cells)} |"
+        cells = " | ".join(map(stats.with_deviation, (final, gain, area)))
+        row = f"| {label[variant]} | {len(seeds)} | {steps[-1] / 1e6:.1f} M | {cells} |"
         rows.append((-final.mean(), row))
     return [row for _, row in sorted(rows)]
 

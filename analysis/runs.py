@@ -174,8 +174,7 @@ def read_plan(path: Path) -> dict[str, Any]:
         DamagedFile: it is none; names the file and what is wrong.
     """
     plan = read_json(path, PLAN)
-    if plan["figure"] != path.stem:  # its name is that of the files that are drawn
-        raise DamagedFile(f"{path}: figure must be {path.stem}, is {plan['figure']!r:.60}")
+    check_figure(path, plan)
     if not plan["title"].isprintable():
         raise DamagedFile(f"{path}: title must be one line of text")
     for i, run in enumerate(plan["runs"]):
@@ -184,6 +183,12 @@ def read_plan(path: Path) -> dict[str, Any]:
             if not pattern.fullmatch(run[key]):
                 raise DamagedFile(f"{path}: runs[{i}]: {key} {run[key]!r:.60} must match {pattern.pattern}")
     return plan
+
+
+def check_figure(path: Path, plan: dict[str, Any]) -> None:
+    """Raise DamagedFile unless a plan is of the figure that its file is named by, as the files drawn of it will be."""
+    if plan["figure"] != path.stem:
+        raise DamagedFile(f"{path}: figure must be {path.stem}, is {plan['figure']!r:.60}")
 
 
 def altered(folder: Path) -> str:

@@ -36,6 +36,11 @@ def standard_deviation(scores: np.ndarray) -> np.ndarray:
     return np.std(scores, axis=0, ddof=1)
 
 
+def with_deviation(scores: np.ndarray) -> str:
+    """Mean ± sample standard deviation of scores (S,) as tables have it, the mean alone for one seed."""
+    return f"{scores.mean():.2f}" + (f" ± {standard_deviation(scores):.2f}" if len(scores) > 1 else "")
+
+
 def interquartile_mean(scores: np.ndarray, axis: int | None = None) -> np.ndarray:
     """Mean of the middle half: a quarter of the sorted scores (rounded down) is cut at either end."""
     return stats.trim_mean(scores, 0.25, axis=axis)

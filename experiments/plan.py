@@ -31,6 +31,24 @@ class Entry:
     variant_label: str
     state: str
 
+    def as_planned(self) -> dict[str, Any]:
+        """What analysis and drawing know of it."""
+        run = self.run
+        return {
+            "run_id": run.run_id,
+            "env": run.env,
+            "env_label": self.env_label,
+            "variant": self.variant,
+            "variant_label": self.variant_label,
+            "seed": run.seed,
+            "iterations": run.config.iterations,
+            "batch_size": run.config.batch_size,
+            "physics": run.options.get("physics", "paper"),
+            "kind": run.kind,
+            "ancestors": [ancestor.run_id for ancestor in run.ancestors],
+            "state": self.state,
+        }
+
 
 @dataclass
 class Plan:
@@ -96,23 +114,7 @@ class Plan:
             "scales": trained_at(self.description),
             "not_trained": [{"env": env, "env_label": env_label(env)} for env in left_out],
             "refused": self.refused,
-            "runs": [
-                {
-                    "run_id": e.run.run_id,
-                    "env": e.run.env,
-                    "env_label": e.env_label,
-                    "variant": e.variant,
-                    "variant_label": e.variant_label,
-                    "seed": e.run.seed,
-                    "iterations": e.run.config.iterations,
-                    "batch_size": e.run.config.batch_size,
-                    "physics": e.run.options.get("physics", "paper"),
-                    "kind": e.run.kind,
-                    "ancestors": [run.run_id for run in e.run.ancestors],
-                    "state": e.state,
-                }
-                for e in (self.whole or self).entries
-            ],
+            "runs": [entry.as_planned() for entry in (self.whole or self).entries],
             "claims": self.description.get("claims", []),
             "notes": self.description.get("notes", []),
         }

@@ -30,7 +30,7 @@ from experiments import sweep
 from experiments.command_line import EXIT_FAILED, EXIT_REQUEUE, Parser, bad_input, clock, run_command
 from experiments.commit import as_csv
 from experiments.config import COMMITTED, CONF, Run, check_choice, choices, compose_run
-from experiments.plan import env_label
+from experiments.plan import Entry, env_label
 from experiments.status import DONE, check_locks, read_status, write_atomically
 from hippo.core.settings import ConfigError
 from paper_figures import curves, style
@@ -39,13 +39,11 @@ ROWS, PAGES = COMMITTED / "studies", Path(__file__).parent.parent / "docs" / "st
 REPORT_SECONDS = 30.0  # between two progress lines
 
 
-@dataclass(frozen=True)
-class Entry:
+@dataclass
+class StudyEntry(Entry):
     """One run of a study."""
 
-    run: Run
     group: str  # the variant of which `over` makes several
-    label: str
 
 
 @dataclass(frozen=True)
@@ -54,32 +52,15 @@ class Study:
 
     name: str
     description: dict[str, Any]
-    entries: list[Entry]
+    entries: list[StudyEntry]
 
     def results(self, frame: pd.DataFrame) -> Results:
         """Rows of the study as those of a figure, so that they can be drawn as one."""
-        described = self.description
-        runs = [
-            {
-                "run_id": e.run.run_id,
-                "env": e.run.env,
-                "env_label": env_label(e.run.env),
-                "variant": e.label,
-                "variant_label": e.label,
-                "seed": e.run.seed,
-                "iterations": e.run.config.iterations,
-                "batch_size": e.run.config.batch_size,
-                "physics": e.run.options.get("physics", "paper"),
-                "kind": e.run.kind,
-                "state": "committed",
-            }
-            for e in self.entries
-        ]
-        plan = {"figure": self.name, "title": described["title"], "runs": runs, "scale": self.entries[0].run.scale}
-        there = set(frame["run_id"])
-        return Results(
-            plan | {"protocol": self.entries[0].run.protocol}, frame, [r for r in runs if r["run_id"] not in there]
-        )
+        runs = [entry.as_planned() for entry in self.entries]
+        first, there = self.entries[0].run, set(frame["run_id"])
+        edition = {"scale": first.scale, "protocol": first.protocol}
+        plan = {"figure": self.name, "title": self.description["title"], "runs": runs, **edition}
+        return Results(plan, frame, [run for run in runs if run["run_id"] not in there])
 
 
 def load(name: str, runs_dir: Path) -> Study:
@@ -99,7 +80,8 @@ def build(name: str, described: dict[str, Any], runs_dir: Path) -> Study:
                     varied = [f"{key}={value}" for key, value in zip(over, values, strict=True)]
                     chosen = [f"env={env}", f"seed={seed}", *described["settings"], *of_env, *settings, *varied]
                     label = ", ".join([group, *(text.removeprefix("algo.") for text in varied)])
-                    entries.append(Entry(compose_run(chosen, runs_dir), group, label))
+                    run = compose_run(chosen, runs_dir)
+                    entries.append(StudyEntry(run, env_label(env), label, label, "committed", group))
     return Study(name, described, entries)
 
 
@@ -128,8 +110,9 @@ def train(study: Study, workers: int, rows: Path) -> int:
         print("stopped; the same command continues where it left off", file=sys.stderr)
     finally:
         parts = [committed] if len(committed) else []
-        parts += [rows_of(study, e) for e in study.entries if read_status(e.run.folder)["state"] == "finished"]
-        kept = pd.concat(parts, ignore_index=True)[COLUMNS].drop_duplicates(COLUMNS[:-1]) if parts else committed
+        new = [entry for entry in study.entries if entry.run in missing]
+        parts += [rows_of(study, e) for e in new if read_status(e.run.folder)["state"] == "finished"]
+        kept = pd.concat(parts, ignore_index=True)[COLUMNS] if parts else committed
         path.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(path, as_csv(kept))
         print(f"{kept['run_id'].nunique()} of {len(study.entries)} runs in {path}")
@@ -142,7 +125,7 @@ def rows_of(study: Study, entry: Entry) -> pd.DataFrame:
     """The rows of a finished run that the study keeps."""
     run = entry.run
     rows = read_progress(run.folder / "progress.csv", study.description["metrics"])
-    labels = {"figure": study.name, "scale": run.scale, "env": run.env, "variant": entry.label}
+    labels = {"figure": study.name, "scale": run.scale, "env": run.env, "variant": entry.variant}
     return rows.assign(**labels, seed=run.seed, run_id=run.run_id)[COLUMNS]
 
 
@@ -153,7 +136,7 @@ def table(study: Study, frame: pd.DataFrame) -> list[str]:
     that `over` makes of one variant the highest is bold.
     """
     environments = list(study.description["environments"])
-    labels = dict.fromkeys((e.group, e.label) for e in study.entries)
+    labels = dict.fromkeys((e.group, e.variant) for e in study.entries)
     finals, areas, counts = {}, {}, {}
     for (_, label), env in itertools.product(labels, environments):
         seeds, _, columns = scores(frame, env, label)
@@ -176,17 +159,12 @@ def table(study: Study, frame: pd.DataFrame) -> list[str]:
     for _, label in labels:
         cells = []
         for env in environments:
-            cells += [str(counts[label, env]), spread(finals[label, env]), spread(areas[label, env])]
+            seeds_there = counts[label, env]
+            words = [stats.with_deviation(x[label, env]) if seeds_there else "" for x in (finals, areas)]
+            cells += [str(seeds_there), *words]
         name = f"**{label}**" if label in best else label
         lines.append(f"| {name} | {' | '.join(cells)} | {f'{score[label]:.2f}' if label in score else ''} |")
     return lines
-
-
-def spread(values: np.ndarray) -> str:
-    """Mean ± standard deviation, as far as there are any."""
-    if not len(values):
-        return ""
-    return f"{values.mean():.2f}" + (f" ± {values.std(ddof=1):.2f}" if len(values) > 1 else "")
 
 
 def page(study: Study, frame: pd.DataFrame, picture: str) -> str:

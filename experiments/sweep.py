@@ -70,10 +70,10 @@ def train_all(todo: Sequence[Run], workers: int, report: Report, in_order: bool 
         while elsewhere and not here:
             time.sleep(1.0)
             states |= {run.run_id: read_status(run.folder)["state"] for run in elsewhere}
-            given_up = [run for run in elsewhere if states[run.run_id] in ("lost", "preempted")]
-            here = [run for run in given_up if not is_locked(run.folder)]  # a stopped process still holds its own
-            elsewhere = [run for run in elsewhere if states[run.run_id] == "running" or run in given_up]
-            elsewhere = [run for run in elsewhere if run not in here]
+            open_ended = [run for run in elsewhere if states[run.run_id] in ("running", "lost", "preempted")]
+            # A stopped process is silent, and still holds its run.
+            here = [run for run in open_ended if states[run.run_id] != "running" and not is_locked(run.folder)]
+            elsewhere = [run for run in open_ended if run not in here]
             report(elsewhere, len(todo) - len(elsewhere) - len(here))
     return states
 

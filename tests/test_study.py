@@ -43,7 +43,7 @@ def trained(tmp_path):
 def test_a_study_is_its_variants_times_what_they_are_tried_over(tmp_path):
     made = study.build("two", TWO, tmp_path)
     assert len({e.run.run_id for e in made.entries}) == 8
-    assert {e.label for e in made.entries} == {"PPO, learning_rate=1e-4", "PPO, learning_rate=3e-4"}
+    assert {e.variant for e in made.entries} == {"PPO, learning_rate=1e-4", "PPO, learning_rate=3e-4"}
     assert [e.run.seed for e in made.entries] == [100] * 4 + [101] * 4  # whole comparisons first
     batches = {e.run.env: e.run.config.batch_size for e in made.entries}
     assert batches["block_hopper"] == 2000 != batches["block_half_cheetah"]
