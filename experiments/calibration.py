@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from experiments.command_line import Parser, bad_input, run_command
-from experiments.crossings import Crossings
+from experiments.crossings import Crossings, totals
 from experiments.evaluate import interval
 from experiments.gait_search import TASKS, actions, committed, row
 from hippo.core import seeding
@@ -61,12 +61,9 @@ def line(task: str, name: str, rows: Sequence[dict[str, Any]]) -> str:
     """One row of the table."""
     walls = np.array([r["crossings"] for r in rows], float)
     low, high = interval(walls)
-    paid = walls.sum()
-    tumbled, height = "-", "-"
-    if paid:
-        tumbled = f"{sum(r['crossings_tumbled'] for r in rows) / paid:.0%}"
-        height = f"{sum(r['crossings'] * (r['crossings_height'] or 0.0) for r in rows) / paid:.2f}"
-    return f"| `{task}` | {name} | {walls.mean():.2f} | {low:.2f} to {high:.2f} | {tumbled} | {height} |"
+    paid, tumbled, height = totals(rows)
+    crossed = f"{tumbled:.0%} | {height:.2f}" if paid else "- | -"
+    return f"| `{task}` | {name} | {walls.mean():.2f} | {low:.2f} to {high:.2f} | {crossed} |"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -1,5 +1,7 @@
 """How walls are cleared on the Block tasks: how far from upright the torso is there, and how high."""
 
+import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -66,11 +68,18 @@ class Crossings:
         ]
 
 
-def summary(rows: list[dict[str, Any]]) -> str:
-    """One line about the crossings in `rows`."""
+def totals(rows: Sequence[dict[str, Any]]) -> tuple[int, float, float]:
+    """Of `rows` together: walls cleared, the share of them with a tumbled torso, its mean height in m; NaN for none."""
     paid = sum(row["crossings"] for row in rows)
     if not paid:
+        return 0, math.nan, math.nan
+    height = sum(row["crossings"] * row["crossings_height"] for row in rows if row["crossings"])
+    return paid, sum(row["crossings_tumbled"] for row in rows) / paid, height / paid
+
+
+def summary(rows: Sequence[dict[str, Any]]) -> str:
+    """One line about the crossings in `rows`."""
+    paid, tumbled, height = totals(rows)
+    if not paid:
         return "no wall was cleared"
-    tumbled = sum(row["crossings_tumbled"] for row in rows)
-    height = sum(row["crossings"] * row["crossings_height"] for row in rows if row["crossings"]) / paid
-    return f"{paid} walls cleared, {tumbled / paid:.0%} of them with |pitch| > {TUMBLED:g} rad, torso at {height:.2f} m"
+    return f"{paid} walls cleared, {tumbled:.0%} of them with |pitch| > {TUMBLED:g} rad, torso at {height:.2f} m"
