@@ -61,7 +61,7 @@ class Results:
 
     def provenance(self) -> str:
         """The runs behind the data and the commits they were trained at, as one line."""
-        ids = sorted(set(self.frame["run_id"]))
+        ids = sorted(self.frame["run_id"].unique())
         digest = hashlib.sha256(" ".join(ids).encode()).hexdigest()[:12]
         commits = ", ".join(self.commits) or "those of the committed results"
         return f"{len(ids)} runs, set {digest}: {' '.join(ids)}; commits: {commits}"
@@ -164,7 +164,7 @@ def load(
         raise MissingData(
             f"{figure}: none of its {len(plan['runs'])} runs at {edition} has a result yet; `{command}` trains them"
         )
-    return Results(plan, frame, missing, read_commits(runs_dir, sorted(set(frame["run_id"]))))
+    return Results(plan, frame, missing, read_commits(runs_dir, sorted(frame["run_id"].unique())))
 
 
 def read_plan(path: Path) -> dict[str, Any]:

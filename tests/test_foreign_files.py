@@ -1,5 +1,6 @@
 """Whatever is read from disk has a schema: one line that names the file, nothing obeyed, nothing written."""
 
+import cProfile
 import errno
 import json
 import os
@@ -148,6 +149,61 @@ def test_long_curves_are_thinned_and_the_bootstrap_in_pieces_gives_the_same_numb
     assert np.array_equal(whole.low, pieces.low)
     assert np.array_equal(whole.high, pieces.high)
     assert stats.bootstrap_mean(values[:, 0], 100).low.shape == ()
+
+
+def long_runs(tmp_path, rows):
+    """The plan and the logs of five finished runs of so many rows each."""
+    names = [str(seed) * 12 for seed in range(5)]
+    runs_of = [RUN | {"run_id": name, "seed": seed, "iterations": rows} for seed, name in enumerate(names)]
+    planned(tmp_path, runs=runs_of)
+    for seed, name in enumerate(names):
+        folder = tmp_path / "runs" / name
+        folder.mkdir(exist_ok=True)
+        values = np.random.default_rng(seed).normal(size=rows).tolist()
+        text = "".join(f"{i},{i * 8000},{value}\n" for i, value in enumerate(values))
+        (folder / "progress.csv").write_text("iteration,env_steps,return_mean\n" + text)
+
+
+def test_drawing_takes_few_calls_per_row(tmp_path, monkeypatch):
+    """Calls instead of seconds, which say as much about the machine."""
+    monkeypatch.setattr(curves.style, "save", lambda *_: [])  # the same for every number of rows
+
+    def calls(rows):
+        place = tmp_path / str(rows)
+        long_runs(place, rows)
+        (place / "smoke").mkdir(exist_ok=True)
+        with cProfile.Profile() as profile:
+            results = runs.load("fig3", "smoke", place / "runs", place / "data")
+            results.provenance()
+            curves.draw(results, place)
+        return sum(each.callcount for each in profile.getstats())
+
+    few, many = curves.MOST_POINTS, 2 * curves.MOST_POINTS
+    calls(few)  # what is imported by the first picture
+    assert (calls(many) - calls(few)) / (5 * (many - few)) < 3
+
+
+def test_rows_are_written_as_pandas_writes_them(tmp_path):
+    planned(tmp_path)
+    written_rows(tmp_path, "iteration,env_steps,return_mean\n0,1,0.1\n1,2,inf\n2,3,nan\n3,4,1e-300\n4,5,-3\n")
+    frame = runs.load("fig3", "smoke", tmp_path / "runs", tmp_path / "data").frame
+    curves.write_rows(frame, tmp_path / "rows.csv")
+    assert (tmp_path / "rows.csv").read_text() == frame.to_csv(index=False, lineterminator="\n")
+
+
+@pytest.mark.slow
+def test_five_runs_of_a_hundred_thousand_rows_are_drawn_in_little_memory(tmp_path):
+    long_runs(tmp_path, 100_000)
+    code = f"""
+import re, time
+from pathlib import Path
+from paper_figures import fig3
+assert fig3.main(["--runs-dir", {str(tmp_path / "runs")!r}, "--out", {str(tmp_path)!r}]) == 0
+print(re.search(r"VmHWM:\\s+(\\d+) kB", Path("/proc/self/status").read_text())[1], time.process_time())
+"""
+    kilobytes, seconds = map(float, python(code).split()[-2:])
+    print(f"{seconds:.1f} CPU-seconds, {kilobytes / 1024:.0f} MB")
+    assert kilobytes / 1024 < 500
 
 
 def test_nothing_in_a_line_of_latex_s_comment_ends_it():
