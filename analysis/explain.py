@@ -17,7 +17,7 @@ import yaml
 
 from analysis.edition import Edition
 from analysis.runs import code_of, read_plan, stretches
-from hippo.core.files import read_json
+from hippo.core.files import printable, read_json
 
 STATED = re.compile(rb"(\d+) runs, set [0-9a-f]{12}: ((?:[0-9a-f]{12} ?)+)")
 
@@ -73,9 +73,7 @@ def describe_run(folder: Path) -> list[str]:
         lines.append(f"needs: {folder.parent / manifest['parent']}")
     if (folder / "status.json").exists():
         status = read_json(folder / "status.json", {"state": str, "iteration": int, "message": str})
-        said = "".join(letter if letter.isprintable() else "?" for letter in status["state"] + "  " + status["message"])
-        state, _, message = said.partition("  ")
-        lines.append(f"{state} at iteration {status['iteration'] + 1}  {message}".rstrip())
+        lines.append(f"{status['state']} at iteration {status['iteration'] + 1}  {status['message']}".rstrip())
     if (folder / "progress.csv").exists():
         rows = list(csv.DictReader((folder / "progress.csv").read_text().splitlines()))
         if rows and "return_mean" in rows[-1]:
@@ -130,14 +128,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     try:
         if options.file.is_dir():
-            print("\n".join(describe_run(options.file)))
-            return 0
-        ids = run_ids(options.file)
-        lines = describe(ids, options.runs_dir)
+            lines = describe_run(options.file)
+        else:
+            ids = run_ids(options.file)
+            lines = [f"{options.file}: {len(ids)} runs", *describe(ids, options.runs_dir)]
     except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    print(f"{options.file}: {len(ids)} runs", *lines, sep="\n")
+    print(*map(printable, lines), sep="\n")
     return 0
 
 

@@ -61,11 +61,6 @@ def bad_input(error: Exception) -> int:
     return EXIT_BAD_INPUT
 
 
-def printable(text: str) -> str:
-    """Text from a file as a terminal may take it: without its escapes."""
-    return "".join(c if c.isprintable() else f"\\x{ord(c):02x}" for c in text)
-
-
 def clock(seconds: float) -> str:
     """Seconds as h:mm:ss."""
     whole = round(seconds)

@@ -41,6 +41,7 @@ OPTIONAL: dict[str, type | tuple[type, ...]] = {
     **dict.fromkeys(("message", "host", "cause"), str),
     "results": dict,
 }
+SILENT = "holds its lock and has been silent: stopped?"  # said of a process whose heartbeat stopped
 NOT_SUPPORTED = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)  # flock's answers of a file system without locks
 
 
@@ -90,9 +91,12 @@ def abandoned(soft: Path) -> bool:
 
 
 def is_locked(folder: Path) -> bool:
-    """Whether somebody holds the lock of a run's folder."""
+    """Whether somebody holds the lock of a run's folder, of either kind; nothing is made or taken over."""
+    lock, soft = folder / ".lock", folder / ".lock.soft"
+    if soft.is_file() and not abandoned(soft):
+        return True
     try:
-        with locked(folder / ".lock"):
+        with FileLock(lock, timeout=0, fallback_to_soft=False) if lock.is_file() else contextlib.nullcontext():
             return False
     except Timeout:
         return True
@@ -205,8 +209,8 @@ def remove_abandoned(folder: Path, older_than: float = 0.0) -> None:
 def read_status(folder: Path) -> dict[str, Any]:
     """A run's status.
 
-    State "missing" where it never started; "lost" where its heartbeat stopped, where status.json is damaged, or where
-    the results of a finished run are no longer what it wrote.
+    State "missing" where it never started; "lost" where nobody holds its lock and its heartbeat stopped, status.json is
+    damaged, or the results of a finished run are no longer what it wrote.
     """
     path = folder / "status.json"
     try:
@@ -219,14 +223,19 @@ def read_status(folder: Path) -> dict[str, Any]:
     except (FileNotFoundError, NotADirectoryError):
         return {"state": "missing", "iteration": -1, "message": ""}
     except (DamagedFile, OSError):  # a power cut; the checkpoint has its own digest
-        return {"state": "lost", "iteration": -1, "message": "status.json is damaged"}
+        return {"iteration": -1, **_lost(folder, "status.json is damaged")}
     defaults: dict[str, Any] = {"iteration": -1, "message": ""}
     status = defaults | status
     if status["state"] == "running" and silence(path) > LOST_AFTER_SECONDS:
-        status |= {"state": "lost", "message": status["message"] or "its heartbeat stopped"}
+        status |= _lost(folder, status["message"] or "its heartbeat stopped")
     if status["state"] == "finished" and (wrong := damage(folder, status.get("iterations", 0), status.get("results"))):
-        status |= {"state": "lost", "message": f"{wrong}; the same command trains what is missing"}
+        status |= _lost(folder, f"{wrong}; the same command trains what is missing")
     return status
+
+
+def _lost(folder: Path, message: str) -> dict[str, str]:
+    """State and message of a run that looks lost: while its lock is held it is not."""
+    return {"state": "running", "message": SILENT} if is_locked(folder) else {"state": "lost", "message": message}
 
 
 def silence(path: Path) -> float:

@@ -28,7 +28,6 @@ from experiments.command_line import (
     Parser,
     bad_input,
     clock,
-    printable,
     run_command,
 )
 from experiments.config import Run, check_choice, choices
@@ -36,6 +35,7 @@ from experiments.console import unattended
 from experiments.launchers import run_locally
 from experiments.plan import Plan, make_plan, overview, refused_lines, summary, trained_at
 from experiments.status import DONE, check_locks, is_locked, read_status
+from hippo.core.files import printable
 from hippo.core.settings import ConfigError
 
 LAUNCHERS = ("local", "slurm")
@@ -71,7 +71,7 @@ def train_all(todo: Sequence[Run], workers: int, report: Report, in_order: bool 
             time.sleep(1.0)
             states |= {run.run_id: read_status(run.folder)["state"] for run in elsewhere}
             open_ended = [run for run in elsewhere if states[run.run_id] in ("running", "lost", "preempted")]
-            # A stopped process is silent, and still holds its run.
+            # What has just been stopped still holds its run for a moment.
             here = [run for run in open_ended if states[run.run_id] != "running" and not is_locked(run.folder)]
             elsewhere = [run for run in open_ended if run not in here]
             report(elsewhere, len(todo) - len(elsewhere) - len(here))
@@ -195,7 +195,7 @@ def status_table(plan: Plan, waiting: dict[str, str]) -> str:
         eta = clock(s["eta"]) if state == "running" and "eta" in s else ""
         cells = f"{run.env:18} {variant:22} {run.seed:4}  {state:10} {done:>11} {eta:>8} {speed:>9}"
         lines.append(f"{run.run_id:12}  {cells}".rstrip())
-        if state in ("failed", "diverged", "lost", "preempted"):
+        if state in ("failed", "diverged", "lost", "preempted") or (state == "running" and s["message"]):
             lines.append(f"{'':14}{printable(s['message'] or state)} (log: {run.folder / 'train.log'})")
     to_retry = may_retry(plan)
     if to_retry:

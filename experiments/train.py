@@ -34,6 +34,7 @@ from experiments.evaluate import as_csv, evaluate_all
 from experiments.manifest import from_manifest, manifest_with_history
 from experiments.status import (
     HEARTBEAT_SECONDS,
+    SILENT,
     Status,
     is_there,
     locked,
@@ -69,12 +70,13 @@ def execute(run: Run) -> str:
         return "preempted" if state == "preempted" else "failed"
     try:
         run.folder.mkdir(parents=True, exist_ok=True)
-        with locked(run.folder / ".lock"), unattended(run.folder / "train.log"):
+        # Not at once refused: who asks for the state of a silent run holds its lock for a blink.
+        with locked(run.folder / ".lock", timeout=0.2), unattended(run.folder / "train.log"):
             return _execute_locked(run)
     except Timeout:
         status = read_status(run.folder)
         soft = run.folder / ".lock.soft"
-        silent = "" if status["state"] == "running" else ", which holds its lock and has been silent: stopped?"
+        silent = f", which {SILENT}" if status["message"] == SILENT else ""
         stale = f" If it is gone, delete {soft}" if silent and soft.exists() else ""
         print(f"{run.run_id} is already running (host {status.get('host')}, pid {status.get('pid')}){silent}{stale}")
         return "running"

@@ -11,13 +11,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from analysis import report_data, runs, stats
+from analysis import explain, report_data, runs, stats
 from experiments import costs, evaluate, launchers, slurm, sweep, train
-from experiments.command_line import printable
 from experiments.config import compose_run
-from experiments.status import TAKE_OVER_SECONDS, check_locks, is_locked, locked, read_status, remove_abandoned
+from experiments.status import (
+    SILENT,
+    TAKE_OVER_SECONDS,
+    check_locks,
+    is_locked,
+    locked,
+    read_status,
+    remove_abandoned,
+)
 from hippo.core import checkpoint
-from hippo.core.files import DamagedFile
+from hippo.core.files import DamagedFile, printable
 from hippo.core.settings import ConfigError
 from hippo.core.skills import SkillsError, read_skills
 from paper_figures import curves, tabular
@@ -226,6 +233,20 @@ def test_terminal_escapes_of_a_status_are_shown_not_obeyed(tmp_path):
     assert runs.code_of({"git_commit": "\x1b]0;x", "git_difference": None}) == "unknown"
 
 
+def test_explain_shows_terminal_escapes_of_all_that_it_prints(tmp_path, monkeypatch, capsys):
+    stub.use(monkeypatch)
+    run = stub.run_in(tmp_path)
+    assert train.execute(run) == "finished"
+    for name, key in (("status.json", "message"), ("manifest.json", "cpu")):
+        path = run.folder / name
+        path.write_text(json.dumps(json.loads(path.read_text()) | {key: "a\x1b[2J"}))
+    capsys.readouterr()
+    assert explain.main([str(run.folder)]) == 0
+    said = capsys.readouterr().out
+    assert "\x1b" not in said
+    assert said.count("a\\x1b[2J") == 2
+
+
 @pytest.mark.parametrize(
     "text", ["[]", "{", "\x00", '{"a": 3}', '{"KEY": {"seconds_per_step": "fast"}}', '{"KEY": {}}']
 )
@@ -380,15 +401,41 @@ def test_a_soft_lock_whose_owner_has_been_silent_for_long_is_taken_over(tmp_path
     long_ago = soft.stat().st_mtime - TAKE_OVER_SECONDS / 2
     for path in (soft, status):
         os.utime(path, (long_ago, long_ago))
-    assert read_status(run.folder)["state"] == "lost"
+    assert read_status(run.folder)["state"] == "running"
     assert is_locked(run.folder)  # so a sweep waits
     assert train.execute(run) == "running"
     assert f"which holds its lock and has been silent: stopped? If it is gone, delete {soft}" in capsys.readouterr().out
     long_ago -= TAKE_OVER_SECONDS
     for path in (soft, status):
         os.utime(path, (long_ago, long_ago))
+    assert read_status(run.folder)["state"] == "lost"
+    assert soft.exists()  # who only looks takes nothing over
     assert train.execute(run) == "finished"
     assert "taken over" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("text", ['{"state": "running", "message": "", "iteration": 0}', "damaged"])
+@pytest.mark.parametrize("kind", ["0", "1"])
+def test_status_and_lock_say_the_same_of_a_silent_run(kind, text, tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("HIPPO_SOFT_LOCKS", kind)
+    stub.use(monkeypatch)
+    run = stub.run_in(tmp_path)
+    run.folder.mkdir()
+    path = run.folder / "status.json"
+    path.write_text(text)
+    os.utime(path, (path.stat().st_mtime - TAKE_OVER_SECONDS / 2,) * 2)
+    with locked(run.folder / ".lock"):
+        monkeypatch.setenv("HIPPO_SOFT_LOCKS", "0")  # of the shell that asks
+        assert is_locked(run.folder)
+        status = read_status(run.folder)
+        assert (status["state"], status["message"]) == ("running", SILENT)
+    assert not is_locked(run.folder)
+    assert read_status(run.folder)["state"] == "lost"
+
+
+def test_asking_for_a_lock_makes_none(tmp_path):
+    assert not is_locked(tmp_path)
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("number", [errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP])
@@ -557,7 +604,19 @@ def test_kernels_have_a_place_where_neither_the_code_nor_home_takes_files(tmp_pa
     monkeypatch.setenv("HOME", "/dev/null")
     place = place_for_kernels(Path("/dev/null"))
     assert os.path.isdir(place)
-    os.rmdir(place)
+
+
+def test_a_temporary_place_for_kernels_goes_when_its_process_ends(tmp_path):
+    code = """
+from pathlib import Path
+from hippo.envs.surroundings import place_for_kernels
+place = Path(place_for_kernels(Path("/dev/null")))
+(place / "kernel.nbc").write_bytes(b"compiled")
+print(place)
+"""
+    place = Path(python(code, HOME="/dev/null", TMPDIR=str(tmp_path), NUMBA_CACHE_DIR="").strip())
+    assert place.parent == tmp_path
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("name", ["glfw", "nonsense"])

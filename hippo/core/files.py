@@ -44,6 +44,11 @@ def set_aside(path: Path, why: str) -> None:
     print(f"warning: {path}: {why}; set aside as {kept.name}", file=sys.stderr, flush=True)
 
 
+def printable(text: str) -> str:
+    """Text from a file as a terminal may take it: without its escapes."""
+    return "".join(c if c.isprintable() else f"\\x{ord(c):02x}" for c in text)
+
+
 def read_json(path: Path, schema: Mapping[str, type | tuple[type, ...]]) -> dict[str, Any]:
     """The JSON object in a file.
 

@@ -3,7 +3,9 @@
 Imported before everything else that imports MuJoCo or compiles a kernel.
 """
 
+import atexit
 import os
+import shutil
 import tempfile
 from pathlib import Path
 
@@ -23,7 +25,7 @@ def import_mujoco_without_opengl() -> None:
 
 
 def place_for_kernels(source: Path) -> str:
-    """Where numba is to keep compiled kernels: "" for its own choice, else a folder of this process alone.
+    """Where numba is to keep compiled kernels: "" for its own choice, else a folder that goes when this process ends.
 
     Args:
         source: the folder of the code, beside which numba keeps them where it can.
@@ -31,7 +33,9 @@ def place_for_kernels(source: Path) -> str:
     chosen: str = config.CACHE_DIR  # type: ignore[attr-defined]
     if chosen or _takes_files(source / "__pycache__") or _takes_files(Path("~/.cache").expanduser()):
         return ""
-    return tempfile.mkdtemp(prefix="hippo-kernels-")
+    place = tempfile.mkdtemp(prefix="hippo-kernels-")
+    atexit.register(shutil.rmtree, place, ignore_errors=True)
+    return place
 
 
 def _takes_files(folder: Path) -> bool:
