@@ -26,7 +26,7 @@ from torch import Tensor, nn
 
 from hippo.core import seeding
 from hippo.core.checkpoint import Checkpoint
-from hippo.core.goals import BODY_GOALS, Goals, Memory, candidate_goals
+from hippo.core.goals import BODY_GOALS, GOAL_SPACES, Goals, Memory, candidate_goals
 from hippo.core.log import RunLog, check_finite
 from hippo.core.replay import Replay
 from hippo.core.rollout import LastInfo, Steps
@@ -62,13 +62,16 @@ class HiroConfig:
     period: int = setting(10, "c, steps between two goals", code="10 (ant_maze.gin:27)", low=1)
     goal_space: str = setting(
         "body",
-        "what goals are about: the robot's pose (body), its place (xy), or both, x and y hidden from the lower level",
+        "what goals are about: the robot's pose (body), its place (xy), or both, x and y hidden from the lower level; "
+        "of gym:<id> the entries of the observation, such as 0:2 or achieved_goal",
         paper="without access to ground-truth (x, y); with, in appendix D",
         code="both (hiro_orig.gin) and xy (hiro_xy.gin)",
-        choices=("body", "xy", "both"),
     )
     position_range: float = setting(
-        10.0, "half range of goals in x and y, m", code="10 (hiro_xy.gin:6); the arena's is 6", above=0.0
+        10.0,
+        "half range of goals in x and y, m; of all goals of gym:<id>, in the unit of the entry",
+        code="10 (hiro_xy.gin:6); the arena's is 6",
+        above=0.0,
     )
     hidden_sizes: list[int] = setting(
         [300, 300], "two hidden layers (ReLU) of all networks", code="300, 300 (base_uvf.gin:34)", low=1, high=WIDEST
@@ -139,8 +142,13 @@ class HiroConfig:
         """Environments side by side, each for one horizon; ceil(batch / horizon)."""
         return -(-self.batch_size // self.horizon)
 
-    def check_environment(self, robot: str, options: dict[str, Any]) -> None:
-        """Raise ConfigError where goals are about entries that the environment's observation does not have."""
+    def check_environment(self, robot: str, options: dict[str, Any], layout: Any = None) -> None:
+        """Refuse goals about entries that the environment's observation, of gym:<id> its `layout`, does not have."""
+        if layout is not None:
+            layout.find("goal_space", self.goal_space)
+            return
+        if self.goal_space not in GOAL_SPACES:
+            raise ConfigError("goal_space", self.goal_space, f"must be one of {', '.join(GOAL_SPACES)}")
         if self.goal_space != "body" and not options.get("position", False):
             raise ConfigError("goal_space", self.goal_space, "needs env.position=true (Gather): no x, y are observed")
         if self.goal_space != "xy" and robot not in BODY_GOALS:
@@ -314,7 +322,10 @@ class Walk:
 
 def make_agents(config: HiroConfig, envs: Any, seed: int) -> Agents:
     """Freshly drawn networks for these environments."""
-    goals = Goals.of(config.goal_space, config.position_range, envs.robot_name, envs.observation_names)
+    if config.goal_space in GOAL_SPACES:
+        goals = Goals.of(config.goal_space, config.position_range, envs.robot_name, envs.observation_names)
+    else:
+        goals = Goals.about(envs.layout.find("goal_space", config.goal_space), config.position_range)
     sizes = envs.single_observation_space.shape[0], envs.single_action_space.shape[0]
     return Agents(config, goals, *sizes, seeding.torch_generator(seed, "initialisation"))
 

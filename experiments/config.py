@@ -27,8 +27,8 @@ from omegaconf.errors import OmegaConfBaseException
 from experiments import synonyms
 from hippo.core.settings import ConfigError, setting
 from hippo.core.skills import SkillsError, read_skills
-from hippo.envs import ENVIRONMENTS
-from hippo.envs.registration import Options, check_options
+from hippo.envs import ENVIRONMENTS, environment, foreign
+from hippo.envs.registration import Options, check_options, option
 
 CONF = Path(__file__).parent / "conf"
 COMMITTED = Path(__file__).parent.parent / "paper_figures" / "data"
@@ -47,7 +47,7 @@ ALGORITHMS = {
 GROUPS = {"env": "block_hopper", "algo": "hippo", "scale": "paper", "protocol": "paper"}
 BUDGET_FIELDS = ("iterations", "batch_size", "horizon")
 # Names and paths: the text after `key=` is taken as it is typed and never parsed, so it may hold any character.
-PLAIN_TEXT = ("runs_dir", "algo.skills", "wandb.project")
+PLAIN_TEXT = ("runs_dir", "algo.skills", "algo.goal_space", "env.skill_view", "wandb.project")
 # Filled in from the run level, or descriptions that no override should touch.
 NOT_OVERRIDDEN = {
     "budget",
@@ -56,6 +56,7 @@ NOT_OVERRIDDEN = {
     "seeds",
     "scale",
     "env.name",
+    "env.id",
     "env.label",
     "env.seconds_per_step",
 } | {f"algo.{name}" for name in BUDGET_FIELDS}
@@ -72,10 +73,19 @@ installed = functools.cache(version)  # reading a package's metadata takes 3 ms,
 
 
 @dataclass
-class EnvConfig(Options):
+class ForeignOptions:
+    """What an environment of Gymnasium's registry, `gym:<id>`, can be told."""
+
+    kwargs: dict[str, Any] = option({}, "gym: arguments of the environment, as {name: value, ...}")
+    skill_view: str = option("", "gym: what skills see, entries a:b or names separated by commas; empty: everything")
+
+
+@dataclass
+class EnvConfig(Options, ForeignOptions):
     """An environment and its options."""
 
     name: str = MISSING
+    id: str = ""  # of Gymnasium's registry, for name gym
     label: str = MISSING
     horizon: int = MISSING
     seconds_per_step: float = MISSING
@@ -191,7 +201,7 @@ class Run:
         """The run that makes this one's skills, one for all seeds as the authors' (Fig. 6); None if they are given."""
         if self.skills != PRETRAINED:
             return None
-        robot = ENVIRONMENTS[self.env].robot
+        robot = environment(self.env).robot
         shared = {name: getattr(self.config, name) for name in SHARED_WITH_SKILLS if hasattr(self.config, name)}
         overrides = [f"algo.{name}={json.dumps(value)}" for name, value in shared.items()]
         overrides += [f"env.{name}={value}" for name, value in self.options.items() if name == "observation"]
@@ -217,13 +227,14 @@ class Run:
                 "algo_revision": algorithm(self.algo).REVISION,
                 "settings": settings,
                 "env": self.env,
-                "env_revision": ENVIRONMENTS[self.env].revision,
+                "env_revision": environment(self.env).revision,
                 "options": self.options,
                 **{name: getattr(self.config, name) for name in BUDGET_FIELDS},
                 "seed": self.seed,
                 "mujoco": installed("mujoco"),
             }
             | ({"protocol": self.protocol} if self.protocol != Run.protocol else {})
+            | ({"package": environment(self.env).package} if foreign.is_foreign(self.env) else {})
             | of_the_kind
             | ({"evaluation": self.evaluation} if self.evaluation else {})
         )
@@ -262,7 +273,7 @@ class Run:
         try:
             plain = yaml.safe_load(text)
             check_choice("algo", plain["algo"], tuple(ALGORITHMS))
-            check_choice("env", plain["env"], tuple(ENVIRONMENTS))
+            _check_group("env", plain["env"])
             check_choice("kind", plain["kind"], KINDS)
             for key, kind in {"seed": int, "options": dict, "config": dict, "scale": str}.items():
                 if not isinstance(plain[key], kind):
@@ -334,14 +345,26 @@ def _register() -> None:
 def _base(env: str, algo: str, scale: str, protocol: str) -> DictConfig:
     """The composed configuration before any override; Hydra is asked once per combination."""
     _register()
-    chosen = {"env": env, "algo": algo, "scale": scale, "protocol": protocol}
+    group = "gym" if foreign.is_foreign(env) else env
+    chosen = {"env": group, "algo": algo, "scale": scale, "protocol": protocol}
     with initialize_config_dir(str(CONF), version_base="1.3"):
         config = compose("config", overrides=[f"{group}={name}" for group, name in chosen.items()])
     if algo in config.protocol.learners:
         of_all = {key: value for key, value in config.protocol.settings.items() if key in config.algo}
         config.algo.merge_with(of_all | dict(config.protocol.learners[algo]))
         config.budget.merge_with(config.protocol.budget.get(scale, {}))
+    if foreign.is_foreign(env):
+        _name_foreign(config, env)
     return config
+
+
+def _name_foreign(config: DictConfig, env: str) -> None:
+    """Fill in the configuration of gym:<id> what the registry knows of it."""
+    limit, longest = environment(env).horizon, config.budget.gym.horizon
+    config.env.id = config.env.label = env.removeprefix(foreign.PREFIX)
+    config.env.horizon = min(limit or longest, longest or limit) or MISSING
+    if "bootstrap_horizon" in config.algo:  # a time limit is none of the task's; the paper's horizon is
+        config.algo.bootstrap_horizon = True
 
 
 def compose_run(overrides: Sequence[str], runs_dir: Path | None = None) -> Run:
@@ -379,7 +402,8 @@ def compose_run(overrides: Sequence[str], runs_dir: Path | None = None) -> Run:
         if override.value() == MISSING:
             raise ConfigError(override.key_or_group, MISSING, "must have a value")
         with _as_config_error(override.key_or_group, override.value()):
-            OmegaConf.update(config, override.key_or_group, override.value())
+            of_any_name = override.key_or_group == "env.kwargs"
+            OmegaConf.update(config, override.key_or_group, override.value(), force_add=of_any_name)
     for key, name in names.items():
         _check_key(config, key, name)
     return _validated(config, groups["algo"], names)
@@ -401,19 +425,28 @@ def _parsed(key: str, text: str) -> Override:
 
 def group_choices(group: str) -> list[str]:
     """The values of env, algo, scale or protocol."""
+    if group == "env":
+        return [name if name in ENVIRONMENTS else f"{foreign.PREFIX}<id>" for name in choices(group)]
     return list(ALGORITHMS) if group == "algo" else choices(group)
 
 
 def _check_group(group: str, value: str) -> str:
+    if group == "env" and foreign.is_foreign(value):
+        with _of_environment(value, {}):
+            environment(value)
+        return value
     valid = group_choices(group)
-    if value not in valid and group == "env" and (meant := synonyms.environment(value, valid)):
+    meant = synonyms.environment(value, valid) if group == "env" and value not in valid else ""
+    if meant:
         raise ConfigError(group, value, f"did you mean {meant}? valid: {', '.join(valid)}")
     return check_choice(group, value, valid)
 
 
 def _check_reward(env: str, algo: str) -> None:
     """Refuse to learn a task where there is none."""
-    if not ENVIRONMENTS[env].pays and algo not in PRETRAINING.values():
+    if foreign.is_foreign(env) and algo in PRETRAINING.values():
+        raise ConfigError("algo", algo, f"makes skills of the robots here, {', '.join(PRETRAINING)}, not in {env}")
+    if not environment(env).pays and algo not in PRETRAINING.values():
         tasks = [name for name, e in ENVIRONMENTS.items() if e.robot == ENVIRONMENTS[env].robot and e.pays]
         there = f"the robot alone is paid nothing, algo={PRETRAINING[env]} brings its own reward"
         raise ConfigError("env", env, f"{there}; did you mean {', '.join(tasks)}?")
@@ -429,7 +462,7 @@ def _check_key(config: DictConfig, key: str, value: Any) -> None:
 def _keys(node: DictConfig, prefix: str = "") -> Iterator[str]:
     for name in map(str, node):
         key, child = f"{prefix}{name}", node._get_node(name)
-        if isinstance(child, DictConfig) and name not in ("budget", "off_policy", "protocol"):
+        if isinstance(child, DictConfig) and name not in ("budget", "off_policy", "protocol", "kwargs"):
             yield from _keys(child, f"{key}.")
         elif key not in NOT_OVERRIDDEN:
             yield key
@@ -444,6 +477,24 @@ def _as_config_error(key: str, value: Any) -> Iterator[None]:
         raise ConfigError(key, value, str(error).splitlines()[0]) from error
 
 
+@contextlib.contextmanager
+def _of_environment(env: str, options: dict[str, Any]) -> Iterator[None]:
+    """Name what an environment refuses, itself or one of its options, by its key in the whole configuration."""
+    try:
+        yield
+    except foreign.Refused as error:
+        raise ConfigError("env" if error.key == "env" else f"env.{error.key}", error.value, error.valid) from error
+    except ValueError as error:
+        setting, valid = str(error).split(": ", 1)
+        key = setting.split("=", 1)[0]
+        raise ConfigError(f"env.{key}", options[key], valid) from error
+
+
+def option_fields() -> list[dataclasses.Field]:
+    """The fields of everything that an environment can be told."""
+    return [*dataclasses.fields(Options), *dataclasses.fields(ForeignOptions)]
+
+
 def level_of(name: str) -> str:
     """Where a setting of an algorithm stands in the whole configuration."""
     return {"iterations": "", "batch_size": "", "horizon": "env."}.get(name, "algo.")
@@ -454,7 +505,7 @@ def _of_algo() -> Iterator[None]:
     """Name a setting that an algorithm refuses by its key in the whole configuration."""
     try:
         yield
-    except ConfigError as error:
+    except (ConfigError, foreign.Refused) as error:
         raise ConfigError(f"{level_of(error.key)}{error.key}", error.value, error.valid) from error
 
 
@@ -464,7 +515,7 @@ def _check_skills(path: str, env: dict[str, Any], settings: dict[str, Any]) -> N
         metadata, _ = read_skills(Path(path))
     except SkillsError as error:
         raise ConfigError("algo.skills", path, f"must be {PRETRAINED} or a skills file ({error})") from error
-    wanted = {"robot": ENVIRONMENTS[env["name"]].robot, "observation": env["observation"]}
+    wanted = {"robot": environment(env["name"]).robot, "observation": env["observation"]}
     wanted |= {name.removeprefix("skill_"): settings[name] for name in SHARED_WITH_SKILLS if name in settings}
     for key, value in wanted.items():
         if metadata[key] != value:
@@ -472,25 +523,28 @@ def _check_skills(path: str, env: dict[str, Any], settings: dict[str, Any]) -> N
 
 
 def _validated(config: DictConfig, algo: str, names: dict[str, str]) -> Run:
+    if OmegaConf.is_missing(config.env, "horizon"):
+        raise ConfigError("env.horizon", MISSING, f"must be given: {config.env.id} has no registered time limit")
     with _as_config_error("config", algo):
         plain: Any = OmegaConf.to_container(config, resolve=True)
     for key, value in names.items():  # here, where nothing is parsed or interpolated any more
         *groups, name = key.split(".")
         functools.reduce(operator.getitem, groups, plain)[name] = value
     env: dict[str, Any] = plain["env"]
+    if env["id"]:
+        env["name"] = f"{foreign.PREFIX}{env['id']}"
     with _of_algo():
         settings = config_class(algo)(**plain["algo"])
-    options = {f.name: env[f.name] for f in dataclasses.fields(Options) if env[f.name] != f.default}
-    try:
+    options = {f.name: env[f.name] for f in option_fields() if env[f.name] != default_of(f)}
+    with _of_environment(env["name"], options):
         check_options(env["name"], options)
-    except ValueError as error:
-        setting, valid = str(error).split(": ", 1)
-        name = setting.split("=", 1)[0]
-        raise ConfigError(f"env.{name}", env[name], valid) from error
     if hasattr(settings, "check_environment"):
+        layout = foreign.layout_of(env["name"], options) if foreign.is_foreign(env["name"]) else None
         with _of_algo():
-            settings.check_environment(ENVIRONMENTS[env["name"]].robot, options)
+            settings.check_environment(environment(env["name"]).robot, options, layout)
     skills = plain["algo"].get("skills", "")
+    if skills == PRETRAINED and foreign.is_foreign(env["name"]):
+        raise ConfigError("algo.skills", skills, f"there are none for {env['name']}; valid: a skills file, or nothing")
     if skills not in ("", PRETRAINED):
         _check_skills(skills, env, plain["algo"])
     check_choice("wandb.mode", plain["wandb"]["mode"], WANDB_MODES)

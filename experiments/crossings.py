@@ -12,9 +12,9 @@ from hippo.envs.vector import RobotTaskEnv
 COLUMNS = ("crossings", "crossings_tumbled", "crossings_height")
 
 
-def has_walls(envs: RobotTaskEnv) -> bool:
+def has_walls(envs: Any) -> bool:
     """Whether there is anything to cross."""
-    return isinstance(envs.task, Blocks)
+    return isinstance(envs, RobotTaskEnv) and isinstance(envs.task, Blocks)
 
 
 class Crossings:

@@ -31,8 +31,8 @@ from hippo.core import seeding
 from hippo.core.checkpoint import Checkpoint, CheckpointError
 from hippo.core.episodes import opening_episodes
 from hippo.core.settings import ConfigError
-from hippo.envs import make
-from hippo.envs.vector import RobotTaskEnv
+from hippo.envs import foreign, make
+from hippo.envs.registration import Options
 
 COLUMNS = (
     "run_id",
@@ -99,7 +99,7 @@ def load_finished_run(folder: Path) -> Run:
     return run
 
 
-def environments(run: Run, num_envs: int, seed: int, **changes: Any) -> RobotTaskEnv:
+def environments(run: Run, num_envs: int, seed: int, **changes: Any) -> Any:
     """The environments of `run`, for its evaluation; `changes` as in `evaluate`.
 
     Raises:
@@ -107,13 +107,20 @@ def environments(run: Run, num_envs: int, seed: int, **changes: Any) -> RobotTas
     """
     if not (run.folder / "checkpoint.pt").exists():
         raise ConfigError("run", run.folder, "has no checkpoint; train it first")
-    options = run.options | {name: value for name, value in changes.items() if value is not None}
+    options = changed_options(run, changes)
     try:
         return make(run.env, num_envs, seeding.integer(seed, "evaluation"), horizon=run.config.horizon, **options)
+    except foreign.Refused as error:
+        raise ConfigError(error.key, error.value, error.valid) from error
     except ValueError as error:
         setting, _, valid = str(error).partition(": ")
         key, _, value = setting.partition("=")
         raise ConfigError(key, value, valid) from error
+
+
+def changed_options(run: Run, changes: dict[str, Any]) -> dict[str, Any]:
+    """The options of `run`'s environment with those of `changes` that are not None."""
+    return run.options | {name: value for name, value in changes.items() if value is not None}
 
 
 def evaluate(run: Run, episodes: int, seed: int, greedy: bool = False, **changes: Any) -> list[dict[str, Any]]:
@@ -127,6 +134,7 @@ def evaluate(run: Run, episodes: int, seed: int, greedy: bool = False, **changes
         ConfigError: there is nothing trained, or no such option.
     """
     envs: Any = environments(run, episodes, seed, **changes)
+    options = changed_options(run, changes)
     if has_walls(envs):
         envs = Crossings(envs)
     streams = seeding.integer(seed, "evaluation of a policy")
@@ -136,8 +144,8 @@ def evaluate(run: Run, episodes: int, seed: int, greedy: bool = False, **changes
         "run_id": name_of(run),
         "algo": run.algo,
         "env": run.env,
-        "perturbation": envs.options.perturbation or "none",
-        "strength": envs.options.strength,
+        "perturbation": options.get("perturbation", Options.perturbation) or "none",
+        "strength": options.get("strength", Options.strength),
         "greedy": greedy,
         "seed": seed,
         "diverged": steps.diverged,

@@ -3,7 +3,9 @@
 import re
 from collections.abc import Collection, Sequence
 
-from hippo.envs import ENVIRONMENTS
+import gymnasium as gym
+
+from hippo.envs import ENVIRONMENTS, foreign
 
 # Keys of this suite, of which a learner has at most some and the first is meant: other people's words for them.
 WORDS = {
@@ -73,8 +75,9 @@ def hint(key: str, known: Collection[str]) -> str:
     return f"no such key; did you mean {there[0]}?{note}"
 
 
-def environment(name: str, valid: Sequence[str]) -> str | None:
-    """The one of `valid` that somebody means by Gymnasium's or another's name, such as HalfCheetah-v5; None if none."""
+def environment(name: str, valid: Sequence[str]) -> str:
+    """What of `valid`, or of Gymnasium's registry, somebody means by a name such as HalfCheetah-v5; "" if nothing."""
     plain = re.sub(r"^.*/|-?v\d+$|[^a-z]", "", name.lower())
     tasks = {e.robot: task for task, e in ENVIRONMENTS.items() if task in valid and task != e.robot}
-    return {each.replace("_", ""): tasks.get(each, each) for each in valid}.get(plain)
+    ours = {each.replace("_", ""): tasks.get(each, each) for each in valid}.get(plain)
+    return " or ".join(filter(None, [ours, f"{foreign.PREFIX}{name}" if name in gym.registry else None]))

@@ -52,6 +52,7 @@ from hippo.core.results import digests
 from hippo.core.settings import ConfigError
 from hippo.core.skills import SkillsError, save_skills
 from hippo.envs import make
+from hippo.envs.foreign import EnvironmentFault
 
 EXIT_CODES = {"finished": 0, "running": 0, "failed": EXIT_FAILED, "diverged": EXIT_DIVERGED, "preempted": EXIT_REQUEUE}
 
@@ -144,7 +145,7 @@ def _work(run: Run, status: Status) -> None:
     except LogError as error:
         status.end("failed", str(error), cause="infrastructure")
         print(f"error: {error}", file=sys.stderr)
-    except (CheckpointError, SkillsError) as error:
+    except (CheckpointError, SkillsError, EnvironmentFault) as error:
         status.end("failed", str(error), cause="error")
         print(f"error: {error}", file=sys.stderr)
     except Exception as error:

@@ -5,9 +5,18 @@ import json
 from pathlib import Path
 from typing import Any
 
-from experiments.config import BUDGET_FIELDS, GROUPS, Run, RunSchema, WandbConfig, group_choices, level_of
-from hippo.envs import ENVIRONMENTS
-from hippo.envs.registration import Options
+from experiments.config import (
+    BUDGET_FIELDS,
+    GROUPS,
+    Run,
+    RunSchema,
+    WandbConfig,
+    default_of,
+    group_choices,
+    level_of,
+    option_fields,
+)
+from hippo.envs import environment
 
 BOUNDS = {"above": "above {}", "low": "at least {}", "high": "at most {}"}
 
@@ -19,10 +28,10 @@ def text(run: Run) -> str:
     mirror = [_of(f, getattr(run, f"wandb_{f.name}"), "wandb.") for f in dataclasses.fields(WandbConfig)]
     config = {f.name: _of(f, getattr(run.config, f.name), level_of(f.name)) for f in dataclasses.fields(run.config)}
     budget = [config.pop(name) for name in BUDGET_FIELDS]
-    values, valid = dataclasses.asdict(Options()) | run.options, ENVIRONMENTS[run.env].options
+    values, valid = {f.name: default_of(f) for f in option_fields()} | run.options, environment(run.env).options
     options = [
         _line(f"env.{f.name}", values[f.name], f.metadata["doc"], valid[f.name])
-        for f in dataclasses.fields(Options)
+        for f in option_fields()
         if f.name in valid
     ]
     sections = {

@@ -142,9 +142,9 @@ MEANT = [
     (["env.name=hopper"], "did you mean env?"),
     (["device=cuda"], "one core of the processor"),
     (["env=hopper-v5"], "env=hopper-v5: did you mean block_hopper? valid: ant, ant_gather,"),
-    (["env=HalfCheetah-v4"], "did you mean block_half_cheetah?"),
-    (["env=hippo/AntGather-v0"], "did you mean ant_gather?"),
-    (["algo=diayn", "env=Walker2d-v5"], "valid: ant, ant_gather,"),
+    (["env=HalfCheetah-v5"], "did you mean block_half_cheetah or gym:HalfCheetah-v5?"),
+    (["env=hippo/AntGather-v0"], "did you mean ant_gather or gym:hippo/AntGather-v0?"),
+    (["algo=diayn", "env=Walker2d-v5"], "did you mean gym:Walker2d-v5? valid: ant, ant_gather,"),
     (["env=hopper"], "paid nothing, algo=diayn brings its own reward; did you mean block_hopper?"),
     (["env=half_cheetah", "algo=ppo"], "did you mean block_half_cheetah?"),
 ]

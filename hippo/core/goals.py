@@ -18,6 +18,7 @@ BODY_GOALS: dict[str, dict[str, float]] = {
     "half_cheetah": {"z": 0.5, "pitch": 1.0}
     | {"bthigh": 0.785, "bshin": 0.785, "bfoot": 0.593, "fthigh": 0.85, "fshin": 1.035, "ffoot": 0.5},
 }
+GOAL_SPACES = ("body", "xy", "both")  # of the robots here
 POSITION = ("position_x", "position_y")  # what env.position=true appends to an observation
 NEAREST = 1e-10  # under the root of the distance, as in the code
 NUM_DRAWN = 8  # candidate goals drawn around the change that was achieved
@@ -39,6 +40,11 @@ class Goals:
         if space != "xy":
             ranges |= BODY_GOALS[robot]
         return cls(torch.tensor([observation_names.index(n) for n in ranges]), torch.tensor([*ranges.values()]))
+
+    @classmethod
+    def about(cls, entries: list[int], half_range: float) -> "Goals":
+        """Goals about these entries of an observation, each within +-half_range."""
+        return cls(torch.tensor(entries), torch.full((len(entries),), half_range))
 
     def of_state(self, obs: Tensor) -> Tensor:
         """S(s): (..., D) -> (..., k)."""

@@ -2,8 +2,8 @@
 
 import hippo.envs.surroundings  # noqa: F401, I001  before MuJoCo is imported
 
-from hippo.envs.registration import ENVIRONMENTS, gymnasium_id, make, register
+from hippo.envs.registration import ENVIRONMENTS, environment, gymnasium_id, make, register
 
-__all__ = ["ENVIRONMENTS", "gymnasium_id", "make"]
+__all__ = ["ENVIRONMENTS", "environment", "gymnasium_id", "make"]
 
 register()

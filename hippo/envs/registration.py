@@ -1,4 +1,4 @@
-"""The environments by name: robot, task, horizon, and which options each of them has."""
+"""The environments by name: robot, task, horizon, and which options each of them has; Gymnasium's others as gym:<id>."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -7,6 +7,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from hippo.envs import foreign
 from hippo.envs.arguments import LARGEST_INT, LARGEST_LONG, autoreset_mode, natural, plain
 from hippo.envs.blocks import Blocks
 from hippo.envs.gather import Gather
@@ -18,6 +19,8 @@ from hippo.envs.vector import RobotTaskEnv
 
 def option(default: Any, doc: str) -> Any:
     """A field of Options with its meaning."""
+    if isinstance(default, dict):
+        return dataclasses.field(default_factory=lambda: dict(default), metadata={"doc": doc})
     return dataclasses.field(default=default, metadata={"doc": doc})
 
 
@@ -43,9 +46,10 @@ class Environment:
 
     robot: str
     task: Any
-    horizon: int  # steps
+    horizon: int  # steps; 0 where none is registered
     revision: int  # bumped when golden trajectories change
-    options: dict[str, tuple[Any, ...]]  # option -> valid values
+    options: dict[str, tuple[Any, ...]]  # option -> valid values, none where they are not listed
+    package: str = ""  # of one of Gymnasium's: where it comes from, and its version
 
     @property
     def pays(self) -> bool:
@@ -89,6 +93,22 @@ ENVIRONMENTS = {
 }
 
 
+def environment(name: str) -> Environment:
+    """One of ENVIRONMENTS, or any that is registered with Gymnasium as `gym:<id>`.
+
+    Raises:
+        ValueError: there is no such environment; the message names it and the valid ones.
+    """
+    if foreign.is_foreign(name):
+        spec = foreign.find(name)
+        options: dict[str, tuple[Any, ...]] = dict.fromkeys(foreign.OPTIONS, ())
+        horizon, package = spec.max_episode_steps or 0, foreign.package(spec)
+        return Environment(name, None, horizon, foreign.REVISION, options, package)
+    if name not in ENVIRONMENTS:
+        raise ValueError(f"env={name}: must be one of {', '.join(ENVIRONMENTS)} or gym:<id>")
+    return ENVIRONMENTS[name]
+
+
 def make(
     name: str,
     num_envs: int,
@@ -97,12 +117,12 @@ def make(
     horizon: int | None = None,
     autoreset: bool | str | gym.vector.AutoresetMode = True,
     **options: Any,
-) -> RobotTaskEnv:
-    """Build a vector environment.
+) -> Any:
+    """Build a vector environment, a RobotTaskEnv or for `gym:<id>` a GymnasiumEnv.
 
     Args:
-        name: a key of ENVIRONMENTS. num_envs: simulations. seed: environment i draws from `seed + i`.
-        num_threads: that MuJoCo steps on; results do not depend on it.
+        name: a key of ENVIRONMENTS or `gym:<id>`. num_envs: simulations. seed: environment i draws from `seed + i`.
+        num_threads: that MuJoCo steps on, in ENVIRONMENTS; results do not depend on it.
         horizon: steps to truncation instead of the environment's own. autoreset: whether ended episodes are followed
         by new ones in the same step (True), when the caller resets them (False), or a mode of Gymnasium's by its value
         ("NextStep": in the next step). options: fields of Options. numpy's scalars count as Python's.
@@ -110,18 +130,22 @@ def make(
     Raises:
         ValueError: a name, option or value that does not exist; the message names it and the valid ones.
     """
-    if name not in ENVIRONMENTS:
-        raise ValueError(f"env={name}: must be one of {', '.join(ENVIRONMENTS)}")
-    environment = ENVIRONMENTS[name]
+    found = environment(name)
     options = check_options(name, options)
+    num_envs, seed = natural("num_envs", num_envs, 1, LARGEST_INT), natural("seed", seed)
+    horizon = natural("horizon", found.horizon if horizon is None else horizon, 1, LARGEST_LONG)
+    if foreign.is_foreign(name):
+        if autoreset_mode(autoreset) is not gym.vector.AutoresetMode.SAME_STEP:
+            raise ValueError(f"autoreset={autoreset}: {name} has SameStep here; gymnasium.make_vec has the others")
+        return foreign.GymnasiumEnv(name, num_envs, seed, horizon, **options)
     return RobotTaskEnv(
-        ROBOTS[environment.robot],
-        environment.task,
+        ROBOTS[found.robot],
+        found.task,
         dataclasses.replace(Options(), **options),
-        natural("num_envs", num_envs, 1, LARGEST_INT),
-        natural("seed", seed),
-        natural("horizon", environment.horizon if horizon is None else horizon, 1, LARGEST_LONG),
-        environment.revision,
+        num_envs,
+        seed,
+        horizon,
+        found.revision,
         natural("num_threads", num_threads, 1, LARGEST_INT),
         autoreset_mode(autoreset),
     )
@@ -210,6 +234,8 @@ def check_option(name: str, key: str, value: Any) -> Any:
 
 def check_options(name: str, options: dict[str, Any]) -> dict[str, Any]:
     """`options` of environment `name` as Python values; ValueError if one is none or, beside the others, idle."""
+    if foreign.is_foreign(name):
+        return foreign.check(name, options)
     options = {key: check_option(name, key, value) for key, value in options.items()}
     if options.get("strength", Options.strength) != Options.strength and options.get("perturbation") is None:
         raise ValueError(f"strength={options['strength']}: changes nothing without a perturbation")

@@ -1,0 +1,348 @@
+"""Any environment that is registered with Gymnasium, as the learners here want it: `gym:<id>`.
+
+Observations become one row of numbers, actions lie in [-1, 1], and an episode that ends is followed by a new one in the
+same step, its last observation in `info["final_obs"]`. What cannot be had so is refused by name.
+"""
+
+import difflib
+import functools
+import importlib
+import importlib.util
+import json
+import re
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.metadata import packages_distributions, version
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+
+PREFIX = "gym:"
+# Packages that register environments when they are imported: module -> what is installed, and how its ids begin.
+PACKAGES = {
+    "gymnasium_robotics": ("gymnasium-robotics", ("Ant", "Point", "Fetch", "Hand", "Adroit", "Franka")),
+    "ale_py": ("ale-py", ("ALE/",)),
+    "minigrid": ("minigrid", ("MiniGrid-", "BabyAI-")),
+}
+OPTIONS = ("kwargs", "skill_view")
+REVISION = 1  # bumped when what is made of an environment here changes
+
+
+class Refused(ValueError):
+    """An environment or an option that cannot be had: the message names the key, the value and what is valid."""
+
+    def __init__(self, key: str, value: object, valid: str) -> None:
+        self.key, self.value, self.valid = key, value, valid
+        super().__init__(f"{key}={value}: {valid}")
+
+
+class EnvironmentFault(RuntimeError):
+    """An environment did what none may do: the message says which, where and when."""
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What an environment's observations and actions are, and how rows are made of them.
+
+    A row holds the entries in `order` of the flattened observation: what skills see, then the rest.
+    """
+
+    keys: tuple[str, ...]  # parts of a Dict observation as they are flattened; empty for a Box
+    names: tuple[str, ...]  # of the entries of a row
+    order: np.ndarray  # (D,) entries of the flattened observation
+    view: int  # how many of them skills see
+    middle: np.ndarray  # (A,) of the action's range
+    half: np.ndarray  # (A,) half of its width
+    dtype: np.dtype  # of actions
+
+    def find(self, key: str, text: str) -> list[int]:
+        """Where in a row the entries stand that `text`, the value of `key`, lists as `skill_view` does.
+
+        Raises:
+            Refused: it lists none, or some that do not exist.
+        """
+        flat = [self.names[i] for i in np.argsort(self.order)]
+        return [self.names.index(flat[i]) for i in _entries(key, text or "nothing", flat)]
+
+    def rows(self, observation: Any, count: int) -> np.ndarray:
+        """(count, D) float32 of a batch of observations."""
+        parts = [observation[key] for key in self.keys] if self.keys else [observation]
+        flat = np.concatenate([np.asarray(part).reshape(count, -1) for part in parts], 1)
+        return flat[:, self.order].astype(np.float32)
+
+
+def is_foreign(name: str) -> bool:
+    """Whether an environment is one of Gymnasium's registry, by its name here."""
+    return name.startswith(PREFIX)
+
+
+def find(name: str) -> EnvSpec:
+    """What is registered under `gym:<id>`; `gym:<module>:<id>` imports the module first, as Gymnasium does.
+
+    Raises:
+        Refused: nothing is; the message says which ids are near, or what has to be installed.
+    """
+    module, _, plain = name.removeprefix(PREFIX).rpartition(":")
+    try:
+        if module:
+            importlib.import_module(module)
+        else:
+            _register(plain)
+        with warnings.catch_warnings():  # of an old version
+            warnings.simplefilter("ignore")
+            return gym.spec(plain)
+    except ImportError as error:
+        raise Refused("env", name, str(error)) from error
+    except gym.error.Error as error:
+        raise Refused("env", name, _instead(plain)) from error
+
+
+def _register(plain: str) -> None:
+    """Import the package that registers the id, if it is none of Gymnasium's own and one of PACKAGES has it."""
+    for module, (_, beginnings) in PACKAGES.items():
+        if plain not in gym.registry and plain.startswith(beginnings) and importlib.util.find_spec(module):
+            gym.register_envs(importlib.import_module(module))
+
+
+def _instead(plain: str) -> str:
+    """What to do about an id that is not registered."""
+    near = difflib.get_close_matches(plain, gym.registry, n=3)
+    if near:
+        return f"no such id is registered; did you mean {', '.join(near)}?"
+    for module, (package, beginnings) in PACKAGES.items():
+        if plain.startswith(beginnings) and importlib.util.find_spec(module) is None:
+            return f"no such id is registered; if it is of {package}: pip install {package}"
+    return "no such id is registered; that of a package of your own is gym:<module>:<id>"
+
+
+def package(spec: EnvSpec) -> str:
+    """The package that an environment comes from and its version; the module alone where it is in none."""
+    entry = spec.entry_point or spec.vector_entry_point
+    module = entry.split(":")[0] if isinstance(entry, str) else str(getattr(entry, "__module__", ""))
+    found = _distributions().get(module.split(".")[0])
+    return f"{found[0]} {version(found[0])}" if found else module
+
+
+@functools.cache
+def _distributions() -> Any:
+    return packages_distributions()
+
+
+def check(name: str, options: dict[str, Any]) -> dict[str, Any]:
+    """`options` of `gym:<id>` if it can be made with them and has spaces that can be learnt in.
+
+    Raises:
+        Refused: it is not so, or there is no such option.
+    """
+    for key in options:
+        if key not in OPTIONS:
+            raise Refused(key, options[key], f"{name} has no such option; its options are {', '.join(OPTIONS)}")
+    layout_of(name, options)
+    return options
+
+
+def layout_of(name: str, options: dict[str, Any]) -> Layout:
+    """The layout of `gym:<id>` with `options`, for which one is made and looked at; Refused where that fails."""
+    return _layout(name, json.dumps(options.get("kwargs", {}), sort_keys=True), options.get("skill_view", ""))
+
+
+@functools.cache
+def _layout(name: str, kwargs: str, skill_view: str) -> Layout:
+    spec = find(name)
+    try:
+        if spec.entry_point is None:
+            env: Any = gym.make_vec(spec, 1, **json.loads(kwargs))
+            observation, action = env.single_observation_space, env.single_action_space
+        else:
+            env = gym.make(spec, disable_env_checker=True, **json.loads(kwargs))
+            observation, action = env.observation_space, env.action_space
+        env.close()
+    except gym.error.DependencyNotInstalled as error:
+        raise Refused("env", name, str(error)) from error
+    except Exception as error:  # whatever a constructor makes of its arguments
+        if json.loads(kwargs):
+            raise Refused("kwargs", kwargs, f"{name} does not take them ({_line(error)})") from error
+        raise Refused("env", name, f"cannot be made ({_line(error)})") from error
+    parts = list(_parts(name, observation))
+    flat = [f"{key}[{i}]" for key, size in parts for i in range(size)]
+    seen = _entries("skill_view", skill_view, flat) or list(range(len(flat)))
+    order = np.array([*seen, *(i for i in range(len(flat)) if i not in set(seen))])
+    low, high = _action_range(name, action)
+    return Layout(
+        tuple(key for key, _ in parts) if isinstance(observation, gym.spaces.Dict) else (),
+        tuple(flat[i] for i in order),
+        order,
+        len(seen),
+        (high + low) / 2,
+        (high - low) / 2,
+        action.dtype,
+    )
+
+
+def _line(error: Exception) -> str:
+    return " ".join(str(error).split())[:200] or type(error).__name__
+
+
+def _parts(name: str, space: gym.Space) -> Any:
+    """(key, entries) of every part of an observation in the order in which it is flattened, that of its Dict."""
+    for key, part in space.spaces.items() if isinstance(space, gym.spaces.Dict) else [("observation", space)]:
+        if not isinstance(part, gym.spaces.Box) or len(part.shape) > 2:
+            what = part if isinstance(space, gym.spaces.Dict) else type(part).__name__
+            valid = "valid are Boxes of at most two dimensions and Dicts of them"
+            raise Refused("env", name, f"observes {what}; {valid}")
+        yield key, int(np.prod(part.shape))
+
+
+def _action_range(name: str, space: gym.Space) -> tuple[np.ndarray, np.ndarray]:
+    if not isinstance(space, gym.spaces.Box) or len(space.shape) != 1:
+        raise Refused("env", name, f"acts in {space}; policies here act in a Box of one dimension")
+    if not np.isfinite([space.low, space.high]).all():
+        raise Refused("env", name, f"acts in {space}; valid are bounded actions (gymnasium.wrappers.RescaleAction)")
+    return space.low.astype(np.float64), space.high.astype(np.float64)
+
+
+def _entries(key: str, text: str, names: Sequence[str]) -> list[int]:
+    """Which of `names` a list like `0:27,30,goal,goal[1]` means: places, slices, parts and names; none for ""."""
+    found: list[int] = []
+    for word in filter(None, text.replace(" ", "").split(",")):
+        number = re.fullmatch(r"(\d+)(?::(\d+))?", word)
+        if number:
+            first, last = int(number[1]), int(number[2] or int(number[1]) + 1)
+            found += range(first, last) if first < last <= len(names) else [-1]
+        else:
+            found += [i for i, name in enumerate(names) if word in (name, name.split("[")[0])] or [-1]
+    if -1 in found or len(set(found)) < len(found):
+        parts = ", ".join(dict.fromkeys(name.split("[")[0] for name in names))
+        valid = f"must list entries below {len(names)}, slices a:b or names, each once; the parts are {parts}"
+        raise Refused(key, text, valid)
+    return found
+
+
+class _Silent(gym.Wrapper):
+    """The same environment without `info`, which would be gathered at every step and read by nobody."""
+
+    def reset(self, **arguments: Any) -> tuple[Any, dict[str, Any]]:
+        return self.env.reset(**arguments)[0], {}
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        return *self.env.step(action)[:4], {}
+
+
+class GymnasiumEnv(gym.vector.VectorEnv):
+    """N environments of one id side by side; ends and time limits are told apart, and an end wins over a limit.
+
+    Args:
+        name: `gym:<id>`. seed: environment i starts from `seed + i`. horizon: the time limit in steps.
+        kwargs: arguments of the environment. skill_view: what skills see (`Layout`), "" for everything.
+        render_mode: Gymnasium's.
+
+    Raises:
+        Refused: what `find` and `check` refuse; its vector environment begins episodes in another way.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        num_envs: int,
+        seed: int,
+        horizon: int,
+        kwargs: dict[str, Any] | None = None,
+        skill_view: str = "",
+        render_mode: str | None = None,
+    ) -> None:
+        kwargs = dict(kwargs or {})
+        self.layout = layout_of(name, {"kwargs": kwargs, "skill_view": skill_view})
+        self.robot_name, self.num_envs, self.horizon = name, num_envs, horizon
+        self.robot_size, self.observation_names = self.layout.view, list(self.layout.names)
+        self.observation_variant = skill_view
+        if render_mode is not None:
+            kwargs["render_mode"] = render_mode
+        self.envs = _vectorised(find(name), num_envs, kwargs | {"max_episode_steps": horizon})
+        mode = self.envs.metadata.get("autoreset_mode")
+        if mode is not AutoresetMode.SAME_STEP:
+            self.envs.close()
+            raise Refused("env", name, f"its vector environment resets by {mode}; needed is {AutoresetMode.SAME_STEP}")
+        self.metadata = self.envs.metadata
+        bound = np.full(len(self.layout.order), np.inf, np.float32)
+        self.single_observation_space = gym.spaces.Box(-bound, bound, dtype=np.float32)
+        self.single_action_space = gym.spaces.Box(-1.0, 1.0, (len(self.layout.half),), np.float32)
+        self.observation_space = gym.vector.utils.batch_space(self.single_observation_space, num_envs)
+        self.action_space = gym.vector.utils.batch_space(self.single_action_space, num_envs)
+        self._first_seed: int | None = seed
+        self._clock = np.zeros(num_envs, np.int64)
+
+    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
+        """Start new episodes, from `seed + i` if one is given.
+
+        Args:
+            options: the environment's own. There is no layout here that `layout_seed` could fix.
+        """
+        options = {key: value for key, value in (options or {}).items() if key != "layout_seed"}
+        seed, self._first_seed = self._first_seed if seed is None else seed, None
+        observation, _ = self.envs.reset(seed=seed, options=options or None)
+        self._clock[:] = 0
+        obs = self.layout.rows(observation, self.num_envs)
+        self._check("observation", np.isfinite(obs).all(1))
+        return obs, {"diverged": np.zeros(self.num_envs, bool)}
+
+    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """One step of every environment; actions (N, A) are clipped to [-1, 1] and scaled to the action's range.
+
+        Raises:
+            EnvironmentFault: an observation or a reward is not finite.
+        """
+        scaled = self.layout.middle + self.layout.half * np.clip(actions, -1, 1)
+        observation, reward, terminated, truncated, info = self.envs.step(scaled.astype(self.layout.dtype))
+        self._clock += 1
+        obs, reward = self.layout.rows(observation, self.num_envs), np.asarray(reward, np.float64)
+        self._check("observation", np.isfinite(obs).all(1))
+        self._check("reward", np.isfinite(reward))
+        truncated = truncated & ~terminated
+        done = terminated | truncated
+        told: dict[str, Any] = {"diverged": np.zeros(self.num_envs, bool)}
+        if done.any():
+            final = obs.copy()
+            for i in np.flatnonzero(done):
+                final[i] = self.layout.rows(_item(info["final_obs"], i), 1)[0]
+            self._check("last observation", np.isfinite(final).all(1))
+            told |= {"final_obs": final, "_final_obs": done}
+            self._clock[done] = 0
+        return obs, reward, terminated, truncated, told
+
+    def _check(self, what: str, fine: np.ndarray) -> None:
+        if not fine.all():
+            i = int(np.flatnonzero(~fine)[0])
+            raise EnvironmentFault(
+                f"{self.robot_name}: {what} of environment {i} is not finite at step {self._clock[i]}"
+            )
+
+    def frame(self) -> np.ndarray:
+        """A picture (H, W, 3) of the first environment, which must have been made to draw them."""
+        return np.asarray(self.envs.render()[0])  # type: ignore[index]
+
+    def close_extras(self, **_: Any) -> None:
+        """Close the environments within."""
+        self.envs.close()
+
+
+def _item(batch: Any, i: int) -> Any:
+    """Observation `i` of a batch, which holds arrays of observations or an array of them."""
+    return {key: part[i] for key, part in batch.items()} if isinstance(batch, dict) else batch[i]
+
+
+def _vectorised(spec: EnvSpec, num_envs: int, kwargs: dict[str, Any]) -> gym.vector.VectorEnv:
+    """The id's own vector environment where it begins episodes in the same step, else copies of the single one."""
+    if spec.vector_entry_point is not None:
+        own = gym.make_vec(spec, num_envs, **kwargs)
+        if own.metadata.get("autoreset_mode") is AutoresetMode.SAME_STEP or spec.entry_point is None:
+            return own
+        own.close()
+
+    def make() -> gym.Env:
+        return _Silent(gym.make(spec, disable_env_checker=True, **kwargs))
+
+    return SyncVectorEnv([make] * num_envs, autoreset_mode=AutoresetMode.SAME_STEP)
