@@ -306,7 +306,7 @@ class GymnasiumEnv(gym.vector.VectorEnv):
         told: dict[str, Any] = {"diverged": np.zeros(self.num_envs, bool)}
         if done.any():
             final = obs.copy()
-            for i in np.flatnonzero(done):
+            for i in np.flatnonzero(done).tolist():
                 final[i] = self.layout.rows(_item(info["final_obs"], i), 1)[0]
             self._check("last observation", np.isfinite(final).all(1))
             told |= {"final_obs": final, "_final_obs": done}
@@ -316,9 +316,8 @@ class GymnasiumEnv(gym.vector.VectorEnv):
     def _check(self, what: str, fine: np.ndarray) -> None:
         if not fine.all():
             i = int(np.flatnonzero(~fine)[0])
-            raise EnvironmentFault(
-                f"{self.robot_name}: {what} of environment {i} is not finite at step {self._clock[i]}"
-            )
+            when = f"at step {self._clock[i]}"
+            raise EnvironmentFault(f"{self.robot_name}: {what} of environment {i} is not finite {when}")
 
     def frame(self) -> np.ndarray:
         """A picture (H, W, 3) of the first environment, which must have been made to draw them."""

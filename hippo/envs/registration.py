@@ -1,4 +1,4 @@
-"""The environments by name: robot, task, horizon, and which options each of them has; Gymnasium's others as gym:<id>."""
+"""The environments by name, with robot, task, horizon and options of each; any other of Gymnasium's as gym:<id>."""
 
 import dataclasses
 from dataclasses import dataclass
