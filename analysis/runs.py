@@ -16,14 +16,15 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from analysis.edition import PAPER, Edition
+from analysis.edition import FIGURE, PAPER, Edition
 from hippo.core.files import DamagedFile, check_object, read_json
 from hippo.core.results import damage
 
 NAME, LABEL = re.compile(r"\w[\w.-]*"), re.compile(r"[^\x00-\x1f\x7f-\x9f]*")
 COLUMN = re.compile(r"\w[\w.:/-]*")  # of progress.csv; nothing that a spreadsheet takes for a formula
 # What names in a plan may be: they become names of files, cells of tables and lines on a terminal.
-PATTERNS = {"run_id": re.compile(r"[0-9A-Za-z_]{1,64}"), "env": NAME, "variant": NAME, "kind": NAME, "physics": NAME}
+PATTERNS = {"run_id": re.compile(r"[0-9A-Za-z_]{1,64}"), "variant": NAME, "kind": NAME, "physics": NAME}
+PATTERNS |= {"env": re.compile(rf"(gym:([\w-]+:)?([\w-]+/)?)?{NAME.pattern}")}  # gym:[package:][namespace/]name
 PATTERNS |= dict.fromkeys(("env_label", "variant_label", "state"), LABEL)
 PLAN: dict[str, type | tuple[type, ...]] = {"figure": str, "scale": str, "title": str, "runs": list}
 PLANNED: dict[str, type | tuple[type, ...]] = {
@@ -137,6 +138,10 @@ def load(
     if (physics > 1).any():
         raise ValueError(f"{figure}: {physics.idxmax()} mixes two kinds of physics")
     committed = read_committed(data_dir / edition.folder / f"{name}.csv", scale)
+    if "committed_in" in plan:  # a sweep of one's own, some of whose runs figures may hold
+        tables = [read_committed(data_dir / edition.folder / f"{other}.csv", scale) for other in plan["committed_in"]]
+        whole = pd.concat([table for table in tables if len(table)] or [committed])
+        committed = whole.drop_duplicates(["run_id", "env_steps", "metric"])
     if metrics is not None:
         committed = committed[committed["metric"].isin(metrics)]
     parts, missing = [], []
@@ -160,7 +165,7 @@ def load(
     frame = pd.concat(parts, ignore_index=True)[COLUMNS] if parts else pd.DataFrame(columns=COLUMNS)
     if frame.empty:
         train = f"python -m experiments.sweep run {figure} {edition.options}"
-        command = train if edition.overrides else f"make {figure} {edition.variables}"
+        command = train if edition.overrides or "committed_in" in plan else f"make {figure} {edition.variables}"
         raise MissingData(
             f"{figure}: none of its {len(plan['runs'])} runs at {edition} has a result yet; `{command}` trains them"
         )
@@ -177,6 +182,9 @@ def read_plan(path: Path) -> dict[str, Any]:
     check_figure(path, plan)
     if not plan["title"].isprintable():
         raise DamagedFile(f"{path}: title must be one line of text")
+    figures = plan.get("committed_in", [])
+    if not isinstance(figures, list) or not all(isinstance(f, str) and FIGURE.fullmatch(f) for f in figures):
+        raise DamagedFile(f"{path}: committed_in must be names of figures")
     for i, run in enumerate(plan["runs"]):
         check_object(path, run, PLANNED, f"runs[{i}]: ")
         for key, pattern in PATTERNS.items():

@@ -66,7 +66,7 @@ KIND_REVISIONS = {"measure": 1, "evaluate": 1}
 PRETRAINING = {"ant": "snn", "snake": "snn", "hopper": "diayn", "half_cheetah": "diayn"}  # robot -> algorithm
 PRETRAINED = "pretrained"  # value of algo.skills: the skills that the robot's pre-training run makes
 SHARED_WITH_SKILLS = ("num_skills", "skill_hidden_sizes", "skill_integration", "log_std_per_skill")
-ONE_VALUE = "must be key=value with one value, which --set gives to every run of a sweep; start one per value"
+ONE_VALUE = "must be key=value with one value; several make a sweep: experiments.sweep run --name NAME --over key=a,b"
 WANDB_MODES = ("disabled", "offline", "online")
 
 installed = functools.cache(version)  # reading a package's metadata takes 3 ms, and a plan asks a thousand times

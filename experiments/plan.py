@@ -56,11 +56,26 @@ class Plan:
 
     figure: str
     edition: Edition
-    description: dict[str, Any]  # conf/figure/<figure>.yaml
+    description: dict[str, Any]  # conf/figure/<figure>.yaml, or what a sweep of one's own makes in its place
     fresh: bool  # committed results do not count
     entries: list[Entry]
     refused: list[dict[str, str]] = dataclasses.field(default_factory=list)  # what the protocol cannot train
     whole: "Plan | None" = None  # of which this is a part
+
+    @property
+    def own(self) -> bool:
+        """Whether it is a sweep of one's own and no figure of the paper."""
+        return "sweep" in self.description
+
+    @property
+    def typed(self) -> str:
+        """What names it on the command line of experiments.sweep: of a sweep of one's own the name is enough."""
+        return self.figure if self.own else f"{self.figure} {self.edition.options}"
+
+    @property
+    def label(self) -> str:
+        """What its jobs are called after."""
+        return "-".join([self.edition.name(self.figure), *self.edition.folder.parts])
 
     def runs(self) -> list[Run]:
         """Its runs and what they depend on, each once, parents first."""
@@ -118,6 +133,8 @@ class Plan:
             "claims": self.description.get("claims", []),
             "notes": self.description.get("notes", []),
         }
+        if self.own:
+            content["committed_in"] = self.description["committed_in"]
         write_atomically(path, json.dumps(content, indent=1))
         return path
 
@@ -140,7 +157,9 @@ def trained_at(description: dict[str, Any]) -> list[str]:
 
 
 def env_label(env: str) -> str:
-    """How figures call an environment."""
+    """How figures call an environment; a foreign one is called by its id."""
+    if env not in choices("env"):
+        return env
     return yaml.safe_load((CONF / "env" / f"{env}.yaml").read_text())["label"]
 
 
@@ -167,10 +186,24 @@ def make_plan(
         if (key := setting.partition("=")[0]) in FIXED:
             raise ConfigError(f"set {key}", setting.partition("=")[2], f"{figure} and the sweep's options decide {key}")
     edition = Edition.of(scale, protocol, settings)
-    seeds = seeds_of(edition)
-    committed = set() if fresh else committed_runs(figure, edition)
+    return resolved(figure, edition, description, settings, fresh, runs_dir)
+
+
+def resolved(
+    figure: str, edition: Edition, description: dict[str, Any], settings: Sequence[str], fresh: bool, runs_dir: Path
+) -> Plan:
+    """The plan that a description makes.
+
+    Args:
+        settings: overrides of every run, after those of the description.
+    """
+    scale, protocol = edition.scale, edition.protocol
+    seeds = description["seeds"] if "seeds" in description else seeds_of(edition)
+    committed: set[str] = set()
+    if not fresh:
+        committed = committed.union(*(committed_runs(f, edition) for f in description.get("committed_in", [figure])))
     left_out = description.get("not_trained", {}).get(scale, [])
-    entries, refused = [], []
+    plan = Plan(figure, edition, description, fresh, [])
     for env in (env for env in description["environments"] if env not in left_out):
         label, of_env = env_label(env), description.get("environment_settings", {}).get(env, [])
         for variant, what in description["variants"].items():
@@ -182,9 +215,12 @@ def make_plan(
             try:
                 first = compose_run([*chosen, *of_env, *what.get("settings", []), *of_scale, *settings], runs_dir)
             except ConfigError as error:
+                if plan.own:
+                    raise ConfigError(error.key, error.value, f"{error.valid} (in {what['label']}, {env})") from error
                 if protocol == PAPER or f"{error.key}={error.value}" not in what.get("settings", []):
                     raise
-                refused.append({"env": env, "env_label": label, "variant_label": what["label"], "why": str(error)})
+                refused = {"env": env, "env_label": label, "variant_label": what["label"], "why": str(error)}
+                plan.refused.append(refused)
                 continue
             if kind is not None:
                 evaluation = description["evaluation"] if kind == "evaluate" else None
@@ -194,8 +230,8 @@ def make_plan(
                 state = read_status(run.folder)["state"]
                 if state != "finished" and run.run_id in committed:
                     state = "committed"
-                entries.append(Entry(run, label, variant, what["label"], state))
-    return Plan(figure, edition, description, fresh, entries, refused)
+                plan.entries.append(Entry(run, label, variant, what["label"], state))
+    return plan
 
 
 def seeds_of(edition: Edition) -> int:

@@ -7,7 +7,6 @@ second `run` submits nothing twice, even if the first was killed between sbatch 
 """
 
 import contextlib
-import dataclasses
 import getpass
 import hashlib
 import json
@@ -20,20 +19,19 @@ import sys
 import time
 import uuid
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import submitit
-import yaml
 
 from experiments import costs
 from experiments.command_line import duration
-from experiments.config import CONF, Run, nearest
+from experiments.config import Run
 from experiments.manifest import ROOT, code_version, git
+from experiments.slurm_profile import Profile
 from experiments.status import ABANDONED_SECONDS, locked, read_status, remove_abandoned, write_atomically
 from experiments.train import execute
-from hippo.core.settings import ConfigError, check, setting
+from hippo.core.settings import ConfigError
 
 POLL_SECONDS = 5.0
 LIVE = {
@@ -42,9 +40,7 @@ LIVE = {
 }
 
 
-# What Slurm's own names and expressions are made of, and nothing that ends a line or a word of the script.
-TEXT = re.compile(r"[\w.,:@+*&|()\[\]-]+")
-JOB_NAME = re.compile("hippo-[0-9a-f]{10}")
+JOB_NAME = re.compile(r"hippo-(?:[\w+-]+-)?[0-9a-f]{10}")  # the plan's label in the middle
 # What a job runs; a snapshot never holds runs, data, environments or earlier snapshots.
 CODE = (
     "hippo",
@@ -57,60 +53,9 @@ CODE = (
     "*.lock",
 )
 CODE_SUFFIXES = (".py", ".yaml", ".xml", ".json", ".pt", ".toml", ".lock", ".typed")
-YEAR = 365 * 24 * 60  # minutes
 MOST_CODE = 50_000_000  # bytes of a snapshot
-
-
-@dataclass
-class Profile:
-    """What a job asks for; conf/slurm/default.yaml."""
-
-    partition: str | None = setting(None, "partition, null for the cluster's default")
-    account: str | None = setting(None, "account")
-    constraint: str | None = setting(None, "constraint on nodes, e.g. a CPU model")
-    time_minutes: int = setting(
-        240, "time limit of a job; two at least, for the signal may come a minute early", low=2, high=YEAR
-    )
-    memory_gb: float = setting(2.0, "memory of a job", low=0.1, high=100_000)
-    cpus: int = setting(1, "CPUs of a job", low=1, high=10_000)
-    parallel: int = setting(100, "jobs of one array that may run at the same time", low=1, high=10_000)
-    group_minutes: int = setting(60, "short runs share a job of about this length; 0: a job each", low=0, high=YEAR)
-    signal_seconds: int = setting(60, "seconds before the limit at which a job is told to stop", low=10, high=65_535)
-
-    def __post_init__(self) -> None:
-        for field in dataclasses.fields(self):
-            value = getattr(self, field.name)
-            if field.name in ("partition", "account", "constraint"):
-                if value is not None and not (isinstance(value, str) and TEXT.fullmatch(value)):
-                    valid = f"must be null or text of letters, digits and {TEXT.pattern}"
-                    raise ConfigError(f"profile {field.name}", repr(value), valid)
-            elif isinstance(value, bool) or not isinstance(value, (int, float) if field.type is float else int):
-                kind = "a number" if field.type is float else "a whole number"
-                raise ConfigError(f"profile {field.name}", repr(value), f"must be {kind}")
-        check(self)
-        if self.signal_seconds >= 60 * self.time_minutes:
-            limit = f"must be below the time limit, {self.time_minutes} minutes"
-            raise ConfigError("profile signal_seconds", self.signal_seconds, limit)
-
-
-def load_profile(path: Path | None) -> Profile:
-    """Read a profile, by default conf/slurm/default.yaml.
-
-    Raises:
-        ConfigError: no such file, no such key, a value out of range.
-    """
-    path = CONF / "slurm" / "default.yaml" if path is None else path
-    try:
-        content = yaml.safe_load(path.read_text())
-    except (OSError, ValueError, yaml.YAMLError) as error:
-        raise ConfigError("profile", path, f"must be a yaml file ({' '.join(str(error).split())})") from error
-    valid = [f.name for f in dataclasses.fields(Profile)]
-    if not isinstance(content, dict):
-        raise ConfigError("profile", path, f"must set some of {', '.join(valid)}")
-    for key in content:
-        if key not in valid:
-            raise ConfigError(f"profile {key}", content[key], nearest(str(key), valid))
-    return Profile(**content)
+DEFAULT_ARRAY = 1000  # jobs of one array where Slurm cannot be asked
+AT_ONCE = 500  # jobs that one scancel names
 
 
 class Job:
@@ -165,34 +110,67 @@ def requeue_unless_cancelled(run: Run) -> None:
 # ---------------------------------------------------------------------------------------------------------- submission
 
 
-def submit(runs: Sequence[Run], runs_dir: Path, profile: Profile, dry_run: bool) -> int:
+def submit(runs: Sequence[Run], runs_dir: Path, profile: Profile, dry_run: bool, label: str = "runs") -> int:
     """Queue `runs`, parents before what depends on them, and return at once; the number of runs submitted.
 
     Runs that already wait in the queue or are being trained are left alone.
+
+    Args:
+        dry_run: only say what would be submitted, for which Slurm need not be here.
+        label: of the plan, after which the jobs are called.
 
     Raises:
         ConfigError: Slurm is not here or refuses.
     """
     folder = runs_dir.absolute() / "slurm"
-    with _private(folder), locked(folder / "submit.lock", timeout=-1):
-        for place in (folder, folder / "batches"):
-            remove_abandoned(place, ABANDONED_SECONDS)
-        live = queued(runs_dir)
+    here = shutil.which("squeue") is not None
+    if dry_run and not here:
+        print("Slurm is not here: what is in the queue is not known, and arrays are cut as its default has it")
+    with contextlib.nullcontext() if dry_run else _alone(folder):
+        live = queued(runs_dir) if here or not dry_run else {}
         todo = [run for run in runs if run.run_id not in live and read_status(run.folder)["state"] != "running"]
-        table, size = costs.known(), max_array_size()
+        table, size = costs.known(), max_array_size() if here or not dry_run else DEFAULT_ARRAY
         before: list[str] = []
         for wave in waves(todo):
             groups = grouped(wave, profile.group_minutes * 60, table)
             jobs = []
             for start in range(0, len(groups), size):
                 part = groups[start : start + size]
-                _describe(part, profile, table, before)
+                _describe(part, profile, table, before, label)
                 if not dry_run:
-                    jobs.append(_submit_array(part, folder, runs_dir.absolute(), profile, before))
+                    jobs.append(_submit_array(part, folder, runs_dir.absolute(), profile, before, label))
             before = jobs
         done = "to submit" if dry_run else "submitted"
         print(f"{len(runs) - len(todo)} already queued or running, {len(todo)} {done}")
     return len(todo)
+
+
+def cancel(label: str, runs_dir: Path) -> int:
+    """Take the jobs of a plan in `runs_dir` out of the queue, those that run too; their number.
+
+    Their runs stay resumable. Other plans' jobs go on, also those that do runs which this plan shares.
+
+    Raises:
+        ConfigError: Slurm is not here or refuses.
+    """
+    if not (runs_dir / "slurm" / "batches").exists():
+        return 0
+    with _alone(runs_dir.absolute() / "slurm"):
+        ours = re.compile(rf"hippo-{re.escape(label)}-[0-9a-f]{{10}}")
+        live = [(job, index) for job, index, name in _live(runs_dir) if ours.fullmatch(name)]
+        jobs = [f"{job}_{index}" if index.isdigit() else job for job, index in live]
+        for start in range(0, len(jobs), AT_ONCE):
+            _ask("scancel", *jobs[start : start + AT_ONCE])
+    return len(jobs)
+
+
+@contextlib.contextmanager
+def _alone(folder: Path) -> Iterator[None]:
+    """While nobody else submits or cancels here."""
+    with _private(folder), locked(folder / "submit.lock", timeout=-1):
+        for place in (folder, folder / "batches"):
+            remove_abandoned(place, ABANDONED_SECONDS)
+        yield
 
 
 @contextlib.contextmanager
@@ -228,23 +206,25 @@ def grouped(runs: Sequence[Run], seconds: float, table: dict[str, Any]) -> list[
     return groups
 
 
-def _describe(groups: list[list[Run]], profile: Profile, table: dict[str, Any], before: list[str]) -> None:
+def _describe(groups: list[list[Run]], profile: Profile, table: dict[str, Any], before: list[str], label: str) -> None:
     longest = max(sum(costs.seconds(run, table) for run in group) for group in groups)
-    asked = {f.name: getattr(profile, f.name) for f in dataclasses.fields(profile)}
-    wanted = ", ".join(f"{name} {value}" for name, value in asked.items() if value is not None)
     behind = f", after {', '.join(before)}" if before else ""
     size = f"array of {len(groups)} jobs, {sum(map(len, groups))} runs"
-    print(f"{size}, the longest {duration(longest)}{behind}: {wanted}")
+    print(f"hippo-{label}: {size}, the longest {duration(longest)}{behind}: {profile}")
 
 
-def _submit_array(groups: list[list[Run]], folder: Path, runs_dir: Path, profile: Profile, before: list[str]) -> str:
+def _submit_array(
+    groups: list[list[Run]], folder: Path, runs_dir: Path, profile: Profile, before: list[str], label: str
+) -> str:
     """One sbatch; returns the id of the array."""
-    name = f"hippo-{uuid.uuid4().hex[:10]}"
+    name = f"hippo-{label}-{uuid.uuid4().hex[:10]}"
     code = snapshot(folder)
     batches = folder / "batches"
     batches.mkdir(exist_ok=True)
     write_atomically(batches / f"{name}.json", json.dumps([[run.run_id for run in group] for group in groups]))
-    executor = submitit.AutoExecutor(folder=folder / "log" / "%j", cluster="slurm", slurm_max_num_timeout=10_000)
+    python = {} if profile.python is None else {"slurm_python": profile.python}
+    log = folder / "log" / "%j"
+    executor = submitit.AutoExecutor(folder=log, cluster="slurm", slurm_max_num_timeout=10_000, **python)
     executor.update_parameters(
         name=name,
         timeout_min=profile.time_minutes,
@@ -253,12 +233,13 @@ def _submit_array(groups: list[list[Run]], folder: Path, runs_dir: Path, profile
         slurm_signal_delay_s=profile.signal_seconds,
         slurm_array_parallelism=profile.parallel,
         slurm_setup=[
+            *(profile.setup or ()),
             f"export PYTHONPATH={shlex.quote(str(code))}",
             f"cd {shlex.quote(str(code))}",
             "export SRUN_CPUS_PER_TASK=$SLURM_CPUS_PER_TASK",  # srun no longer inherits it
         ],
-        slurm_additional_parameters={"requeue": True} | _dependency(before),
-        **{f"slurm_{key}": value for key in ("partition", "account", "constraint") if (value := getattr(profile, key))},
+        slurm_additional_parameters={"requeue": True} | profile.extra_options | _dependency(before),
+        **profile.options,
     )
     try:
         jobs = executor.map_array(Job(runs_dir), [[run.to_yaml() for run in group] for group in groups])
@@ -380,17 +361,25 @@ def max_array_size() -> int:
 
 def queued(runs_dir: Path) -> dict[str, str]:
     """Run id -> job of every run that Slurm still means to do."""
+    live: dict[str, str] = {}
+    for job, index, name in _live(runs_dir):
+        path = runs_dir / "slurm" / "batches" / f"{name}.json"
+        live |= dict.fromkeys(_batch(path, int(index) if index.isdigit() else 0), f"{job}_{index}")
+    return live
+
+
+def _live(runs_dir: Path) -> list[tuple[str, str, str]]:
+    """Array, index and name of every job of `runs_dir` that has not ended."""
     batches = runs_dir / "slurm" / "batches"
     if not batches.exists():
-        return {}
-    live: dict[str, str] = {}
+        return []
+    found = []
     # The name last: a job of somebody else's making may have anything in it.
     for line in _ask("squeue", "-h", "-r", "-u", getpass.getuser(), "-o", "%K|%F|%T|%j").splitlines():
         index, job, state, name = [*line.split("|", 3), "", "", ""][:4]
-        path = batches / f"{name}.json"
-        if state in LIVE and JOB_NAME.fullmatch(name) and path.exists():
-            live |= dict.fromkeys(_batch(path, int(index) if index.isdigit() else 0), f"{job}_{index}")
-    return live
+        if state in LIVE and JOB_NAME.fullmatch(name) and (batches / f"{name}.json").exists():
+            found.append((job, index, name))
+    return found
 
 
 def _batch(path: Path, index: int) -> list[str]:

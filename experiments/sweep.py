@@ -5,6 +5,13 @@ python -m experiments.sweep run fig3 --scale smoke     do it; the same command a
 python -m experiments.sweep write all --scale laptop   only the plans that drawing reads; train and measure nothing
 python -m experiments.sweep status fig3 --watch        how every run is doing
 python -m experiments.sweep retry fig3                 once more what the machine, not the code, made fail
+python -m experiments.sweep cancel fig3                take its jobs out of Slurm's queue
+python -m experiments.sweep collect FOLDER...          take finished runs over from other runs folders
+
+A sweep of your own goes by its name in the place of a figure (docs/own_sweep.md):
+
+python -m experiments.sweep run --name lr --over algo=hippo,ppo --over algo.learning_rate=1e-4,3e-4 --seeds 5
+python -m experiments.sweep compare lr                 its learning curves and a table; or any runs: runs/a runs/b
 """
 
 import argparse
@@ -20,7 +27,7 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from experiments import costs, slurm
+from experiments import collect, costs, own_sweep, slurm
 from experiments.command_line import (
     EXIT_FAILED,
     EXIT_NOT_AGREED,
@@ -33,17 +40,20 @@ from experiments.command_line import (
 from experiments.config import Run, check_choice, choices
 from experiments.console import unattended
 from experiments.launchers import run_locally
+from experiments.own_compare import compare
 from experiments.plan import Plan, make_plan, overview, refused_lines, summary, trained_at
+from experiments.slurm_profile import load_profile
 from experiments.status import DONE, check_locks, is_locked, read_status
+from experiments.status_table import may_retry, show_status
 from hippo.core.files import printable
 from hippo.core.settings import ConfigError
 
 LAUNCHERS = ("local", "slurm")
 ORDERS = ("longest", "seeds")
+TARGETS = "a figure or table of conf/figure, or a sweep of your own; `plan` and `write` also take all"
 REPORT_SECONDS = 10.0  # between two progress lines
 NAMED = 4  # runs in progress that a progress line names
 CORE_HOURS = 2.0  # more than this is not started without being agreed to
-MAX_ATTEMPTS = 3  # of a run that the machine made fail, before `retry` leaves it alone
 
 
 Report = Callable[[Sequence[Run], int], None]  # takes the runs in progress and the number of those that ended
@@ -141,8 +151,9 @@ def run_figure(plan: Plan, todo: Sequence[Run], train: TrainAll, runs_dir: Path)
     if todo:
         start_of_line = "\r" if terminal else ""
         print(f"{start_of_line}[{len(todo)}/{len(todo)}] done in {clock(time.monotonic() - started)}")
-    if plan.edition.overrides:
-        print(f"with overrides, a figure of its own: {drawing(plan)} --runs-dir {shlex.quote(str(runs_dir))}")
+    if plan.own or plan.edition.overrides:
+        what = "learning curves and a table" if plan.own else "with overrides, a figure of its own"
+        print(f"{what}: {drawing(plan)} --runs-dir {shlex.quote(str(runs_dir))}")
     return name_failures(plan, todo, states)
 
 
@@ -175,54 +186,13 @@ def name_failures(plan: Plan, todo: Sequence[Run], states: dict[str, str]) -> in
     return EXIT_FAILED if bad else 0
 
 
-def status_table(plan: Plan, waiting: dict[str, str]) -> str:
-    """A line per run: state, progress, ETA, speed; of those that ended badly also cause, log and what to type.
-
-    Args:
-        waiting: run id -> Slurm job of what is in the queue.
-    """
-    columns = f"{'environment':18} {'variant':22} {'seed':>4}  {'state':10} {'iteration':>11} {'ETA':>8} {'steps/s':>9}"
-    lines = [f"{'run':12}  {columns}"]
-    variants = {e.run.run_id: (e.variant, e.state) for e in plan.entries}
-    for run in plan.runs():
-        variant, state = variants.get(run.run_id, (run.kind, ""))
-        s = read_status(run.folder)
-        state = state if state == "committed" else s["state"]
-        if run.run_id in waiting and state not in (*DONE, "running"):
-            state = "pending"
-        done = f"{s.get('iteration', -1) + 1}/{run.config.iterations}"
-        speed = f"{s['steps_per_second']:,.0f}" if s.get("steps_per_second") else ""
-        eta = clock(s["eta"]) if state == "running" and "eta" in s else ""
-        cells = f"{run.env:18} {variant:22} {run.seed:4}  {state:10} {done:>11} {eta:>8} {speed:>9}"
-        lines.append(f"{run.run_id:12}  {cells}".rstrip())
-        if state in ("failed", "diverged", "lost", "preempted") or (state == "running" and s["message"]):
-            lines.append(f"{'':14}{printable(s['message'] or state)} (log: {run.folder / 'train.log'})")
-    to_retry = may_retry(plan)
-    if to_retry:
-        lines.append(
-            f"{len(to_retry)} to try again: python -m experiments.sweep retry {plan.figure} {plan.edition.options}"
-        )
-    return "\n".join(lines)
-
-
-def may_retry(plan: Plan) -> list[Run]:
-    """Runs that the machine made fail: killed, preempted, disk full; not those that diverged or met a bug."""
-    chosen = []
-    for run in plan.runs():
-        status = read_status(run.folder)
-        machine = status["state"] in ("lost", "preempted") or status.get("cause") == "infrastructure"
-        if machine and status["state"] not in (*DONE, "running") and status.get("attempts", 0) < MAX_ATTEMPTS:
-            chosen.append(run)
-    return chosen
-
-
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     """The command line."""
     parser = Parser(prog="experiments.sweep", description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("action", choices=tuple(ACTIONS))
-    parser.add_argument("figure", help="a figure or table of conf/figure; `plan` and `write` also take all")
-    parser.add_argument("--scale", default="smoke", help="smoke, laptop or paper")
-    parser.add_argument("--protocol", default="paper", help="paper or modern")
+    parser.add_argument("targets", nargs="*", metavar="figure", help=TARGETS)
+    parser.add_argument("--scale", help="smoke (default), laptop or paper")
+    parser.add_argument("--protocol", help="paper (default) or modern")
     parser.add_argument("--launcher", default="local", help=", ".join(LAUNCHERS))
     parser.add_argument("--workers", type=int, default=len(os.sched_getaffinity(0)), help="processes, one thread each")
     parser.add_argument("--profile", type=Path, help="slurm: what jobs ask for (default: conf/slurm/default.yaml)")
@@ -241,7 +211,9 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--yes", action="store_true", help="start it all the same")
     parser.add_argument("--watch", action="store_true", help="status: again and again until nothing runs")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="override in every run")
-    return parser.parse_args(arguments)
+    own_sweep.add_options(parser)
+    parser.add_argument("--out", type=Path, help="compare: where pictures and tables go")
+    return parser.parse_intermixed_args(arguments)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -249,7 +221,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parse(arguments)
 
     def plan_of(figure: str) -> Plan:
-        plan = make_plan(figure, options.scale, options.set, options.fresh, options.runs_dir, options.protocol)
+        if (sweep := own_sweep.chosen(options)) is not None:
+            plan = sweep.plan(own_sweep.harmless(options.set), options.fresh, options.runs_dir)
+        else:
+            edition = options.scale or "smoke", options.protocol or Run.protocol
+            plan = make_plan(figure, edition[0], options.set, options.fresh, options.runs_dir, edition[1])
         plan = plan.within(options.env) if options.env and plan.entries else plan
         plan = plan.by_seed() if options.order == "seeds" else plan
         return plan.only(options.only) if options.only else plan
@@ -269,6 +245,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def check_options(options: argparse.Namespace) -> None:
     """Raise ConfigError for what argparse does not check."""
     check_choice("launcher", options.launcher, LAUNCHERS)
+    several = options.action in ("compare", "collect")
+    if len(options.targets) > 1 and not several:
+        raise ConfigError("figure", " ".join(options.targets), f"{options.action} takes one figure or sweep at a time")
+    options.figure = options.targets[0] if options.targets else None
     check_choice("order", options.order, ORDERS if options.launcher == "local" else ORDERS[:1])
     if options.workers < 1:
         raise ConfigError("workers", options.workers, "must be at least 1")
@@ -297,6 +277,7 @@ def write_plans(options: argparse.Namespace, plan_of: Callable[[str], Plan]) -> 
     plans = [plan_of(figure) for figure in named(options)]
     check_runs_dir(options.runs_dir)
     for plan in plans:
+        own_sweep.store(plan, options.runs_dir)
         plan.write(options.runs_dir)
     return 0
 
@@ -304,18 +285,6 @@ def write_plans(options: argparse.Namespace, plan_of: Callable[[str], Plan]) -> 
 def named(options: argparse.Namespace) -> list[str]:
     """The figures and tables that the command line names."""
     return choices("figure") if options.figure == "all" else [options.figure]
-
-
-def show_status(options: argparse.Namespace, plan_of: Callable[[str], Plan]) -> int:
-    """`status`, once or until nothing runs or waits any more."""
-    while True:
-        plan, waiting = plan_of(options.figure), slurm.queued(options.runs_dir)
-        clear = "\x1b[2J\x1b[H" if options.watch and sys.stdout.isatty() else ""
-        print(clear + status_table(plan, waiting), flush=True)
-        active = (r.run_id in waiting or read_status(r.folder)["state"] == "running" for r in plan.runs())
-        if not options.watch or not any(active):
-            return 0
-        time.sleep(2.0)
 
 
 def run_or_retry(options: argparse.Namespace, plan_of: Callable[[str], Plan]) -> int:
@@ -330,8 +299,8 @@ def run_or_retry(options: argparse.Namespace, plan_of: Callable[[str], Plan]) ->
         plan.write(options.runs_dir)
         return 0
     todo = plan.todo() if options.action == "run" else may_retry(plan)
-    profile = slurm.load_profile(options.profile) if options.launcher == "slurm" else None
-    if profile is not None:
+    profile = load_profile(options.profile) if options.launcher == "slurm" else None
+    if profile is not None and not options.dry_run:
         slurm.check_installed()
     hours = sum(costs.reference_seconds(run) for run in todo) / 3600
     if hours >= options.max_core_hours and todo and not options.yes and not options.dry_run:
@@ -339,11 +308,12 @@ def run_or_retry(options: argparse.Namespace, plan_of: Callable[[str], Plan]) ->
         return EXIT_NOT_AGREED
     if not options.dry_run:
         check_runs_dir(options.runs_dir)
-    if options.action == "run" and options.scale != "smoke" and not options.dry_run:
+        own_sweep.store(plan, options.runs_dir)
+    if options.action == "run" and plan.edition.scale != "smoke" and not options.dry_run:
         costs.calibrate(todo)
     print(summary(plan), flush=True)
     if profile is not None:
-        slurm.submit(todo, options.runs_dir, profile, options.dry_run)
+        slurm.submit(todo, options.runs_dir, profile, options.dry_run, plan.label)
     if options.dry_run:
         return 0
     plan.write(options.runs_dir)
@@ -363,21 +333,40 @@ def ask(plan: Plan, runs: int, hours: float, options: argparse.Namespace) -> str
     The number is that of the committed reference costs, so that the answer is the same on every machine, every time.
     """
     target, variables = plan.figure, plan.edition.variables
-    overridden = bool(plan.edition.overrides)  # make knows none
-    agree = "--yes" if overridden else f"make {target} {variables} YES=1, or --yes"
-    draw = drawing(plan) if overridden else f"make draw-{target} {variables}"
+    agree, draw = f"make {target} {variables} YES=1, or --yes", f"make draw-{target} {variables}"
+    measure = f"make plan-{target} {variables}"
+    if plan.own or plan.edition.overrides:  # make knows none
+        agree, draw, measure = "--yes", drawing(plan), "`plan` in the place of `run`"
     return (
         f"not started: {target} at {plan.edition} has {runs} runs to train, about {hours:,.1f} core-hours; "
         f"from {options.max_core_hours:g} on (--max-core-hours) you are asked\n"
         f"  estimate: environment steps times the committed seconds per step ({costs.reference_source()}); "
-        f"make plan-{target} {variables} measures this machine\n"
+        f"{measure} measures this machine\n"
         f"  to agree: {agree}; without training: {draw}"
     )
 
 
 def drawing(plan: Plan) -> str:
-    """The command that draws a plan, which is the only one for a plan with overrides."""
+    """The command that draws a plan, which is the only one for a plan with overrides or of one's own."""
+    if plan.own:
+        return f"python -m experiments.sweep compare {plan.figure}"
     return f"python -m paper_figures.{plan.figure} {plan.edition.options}"
+
+
+def cancel(options: argparse.Namespace, plan_of: Callable[[str], Plan]) -> int:
+    """`cancel`."""
+    plan = plan_of(options.figure)
+    jobs = slurm.cancel(plan.label, options.runs_dir)
+    elsewhere = "" if jobs else "; what was started with --launcher local ends at Ctrl-C"
+    print(f"{plan.figure}: {jobs} jobs cancelled{elsewhere}")
+    return 0
+
+
+def take_over(options: argparse.Namespace, _plan_of: Callable[[str], Plan]) -> int:
+    """`collect`."""
+    collect.check(options.targets)
+    check_runs_dir(options.runs_dir)
+    return collect.collect([Path(folder) for folder in options.targets], options.runs_dir)
 
 
 ACTIONS = {
@@ -386,6 +375,9 @@ ACTIONS = {
     "run": run_or_retry,
     "status": show_status,
     "retry": run_or_retry,
+    "cancel": cancel,
+    "compare": compare,
+    "collect": take_over,
 }
 
 

@@ -285,7 +285,7 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--from-manifest", type=Path)
     options = parser.parse_intermixed_args(arguments)
     if options.multirun:
-        parser.error("--multirun: one command, one run; loop over it in the shell, or see experiments.sweep --help")
+        parser.error("--multirun: one command, one run; several: experiments.sweep run --name NAME --over key=a,b")
     if options.cfg and "job" in options.settings:  # Hydra's way to say it
         options.settings.remove("job")
     return options

@@ -216,7 +216,7 @@ def test_cfg_prints_the_composed_run_and_trains_nothing(flags, tmp_path, monkeyp
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["-m", "seed=1,2"], "error: --multirun: one command, one run; loop over it in the shell, or see"),
+        (["-m", "seed=1,2"], "error: --multirun: one command, one run; several: experiments.sweep run"),
         (["--multirun"], "experiments.sweep"),
         (["--lr=1e-3"], "--lr=1e-3"),
         (["--from-manifest"], "--from-manifest"),

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from analysis import explain, report_data, runs, stats
-from experiments import costs, evaluate, launchers, slurm, sweep, train
+from experiments import costs, evaluate, launchers, slurm, slurm_profile, sweep, train
 from experiments.config import compose_run
 from experiments.status import (
     SILENT,
@@ -489,13 +489,13 @@ def test_temporary_files_of_killed_processes_are_removed_at_the_next_start(tiny,
 def test_a_bad_profile_is_one_line(text, key, tmp_path):
     (tmp_path / "p.yaml").write_text(text)
     with pytest.raises(ConfigError, match=key) as caught:
-        slurm.load_profile(tmp_path / "p.yaml")
+        slurm_profile.load_profile(tmp_path / "p.yaml")
     assert "\n" not in str(caught.value)
 
 
 def test_what_sbatch_takes_is_taken(tmp_path):
     (tmp_path / "p.yaml").write_text("constraint: '[rack1*2&rack2*4]'\npartition: gpu,cpu-long\nmemory_gb: 0.5")
-    assert slurm.load_profile(tmp_path / "p.yaml").memory_gb == 0.5
+    assert slurm_profile.load_profile(tmp_path / "p.yaml").memory_gb == 0.5
 
 
 def test_slurm_without_slurm_is_one_line_and_writes_nothing(tiny, tmp_path, monkeypatch, capsys):

@@ -22,6 +22,8 @@ ALLOWED = {
     "analysis/runs.py": ("hippo.core.files", "hippo.core.results"),
     "analysis/explain.py": ("hippo.core.files",),
     "experiments/plan.py": ("analysis.edition",),  # where plans lie is agreed on once
+    "experiments/own_sweep.py": ("analysis.edition",),
+    "experiments/own_compare.py": ("analysis.runs", "paper_figures"),  # a sweep of one's own is drawn by its name
     "experiments/commit.py": ("analysis",),  # from run folders to committed rows
     "experiments/study.py": ("analysis", "paper_figures"),  # from a file of runs to their page
 }

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from experiments import slurm, sweep
+from experiments import slurm, slurm_profile, sweep
 from experiments.config import compose_run
 from experiments.launchers import run_locally
 from experiments.plan import make_plan
@@ -53,7 +53,7 @@ def long_run(cluster, tmp_path_factory):
     """A run whose job is told to stop 20 to 80 seconds after every start; submitted before anything else."""
     runs_dir = tmp_path_factory.mktemp("long")
     run = compose_run([*LONG, f"runs_dir={runs_dir}"])
-    profile = slurm.Profile(time_minutes=2, signal_seconds=100, memory_gb=1.0)
+    profile = slurm_profile.Profile(time_minutes=2, signal_seconds=100, memory_gb=1.0)
     assert slurm.submit([run], runs_dir, profile, dry_run=False) == 1
     return run
 
@@ -125,7 +125,7 @@ def test_a_sweep_survives_a_kill_a_cancellation_and_a_restarted_node(long_run, c
 def test_what_depends_on_another_run_waits_for_it(cluster, tmp_path):
     train = compose_run(["env=snake_gather", "scale=smoke", "iterations=2", "batch_size=400", f"runs_dir={tmp_path}"])
     measure = dataclasses.replace(train, kind="measure")
-    profile = slurm.Profile(time_minutes=10, memory_gb=1.0)
+    profile = slurm_profile.Profile(time_minutes=10, memory_gb=1.0)
     assert slurm.submit([train, measure], tmp_path, profile, dry_run=False) == 2
     assert slurm.wait([train, measure], tmp_path, lambda *_: None) == {
         train.run_id: "finished",
