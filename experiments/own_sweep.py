@@ -234,12 +234,12 @@ def asked_for(options: argparse.Namespace) -> Sweep:
     for key in settings_of(common):
         if key in over:
             raise ConfigError(f"set {key}", settings_of(common)[key], "is among --over already")
-    scale, protocol = options.scale or file.get("scale", "smoke"), options.protocol or file.get("protocol", PAPER)
+    asked = {"scale": "smoke", "protocol": PAPER} | file
+    asked |= {key: value for key in ("scale", "protocol", "seeds") if (value := getattr(options, key)) is not None}
+    scale, protocol = asked["scale"], asked["protocol"]
     check_choice("scale", scale, choices("scale"))
     check_choice("protocol", protocol, choices("protocol"))
-    seeds = options.seeds if options.seeds is not None else file.get("seeds")
-    if seeds is None:
-        seeds = seeds_of(Edition(scale, protocol))
+    seeds = asked["seeds"] if "seeds" in asked else seeds_of(Edition(scale, protocol))
     if isinstance(seeds, bool) or not isinstance(seeds, int) or not 1 <= seeds <= MOST:
         raise ConfigError("seeds", seeds, f"must be a whole number from 1 to {MOST:,}")
     return Sweep(name, over, settings_of(telling(common)), seeds, scale, protocol)

@@ -224,8 +224,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if (sweep := own_sweep.chosen(options)) is not None:
             plan = sweep.plan(own_sweep.harmless(options.set), options.fresh, options.runs_dir)
         else:
-            edition = options.scale or "smoke", options.protocol or Run.protocol
-            plan = make_plan(figure, edition[0], options.set, options.fresh, options.runs_dir, edition[1])
+            scale = "smoke" if options.scale is None else options.scale
+            protocol = Run.protocol if options.protocol is None else options.protocol
+            plan = make_plan(figure, scale, options.set, options.fresh, options.runs_dir, protocol)
         plan = plan.within(options.env) if options.env and plan.entries else plan
         plan = plan.by_seed() if options.order == "seeds" else plan
         return plan.only(options.only) if options.only else plan
