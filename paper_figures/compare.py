@@ -49,7 +49,9 @@ def planned(folder: Path) -> dict[str, Any]:
         raise ValueError(f"{folder}: is a run of kind {config['kind']}; only training runs are compared")
     label = " ".join([identity["algo"], *(f"{key}={value}" for key, value in own.items())])
     budget = {key: identity[key] for key in ("env", "seed", "iterations", "batch_size")}
-    labels = {"env_label": identity["env"].replace("_", " ").title(), "variant": label, "variant_label": label}
+    env = identity["env"]
+    env_label = env if env.startswith("gym:") else env.replace("_", " ").title()
+    labels = {"env_label": env_label, "variant": label, "variant_label": label}
     rest = {"physics": identity["options"].get("physics", "paper"), "kind": "train", "state": "finished"}
     edition = {"scale": config["scale"], "protocol": config.get("protocol", PAPER)}
     return {"run_id": manifest["run_id"]} | edition | budget | labels | rest

@@ -16,6 +16,7 @@ from experiments.config import COMMITTED, compose_run
 from experiments.own_sweep import UNASKED, stored, values_of
 from experiments.plan import make_plan
 from experiments.status import Status, read_status
+from experiments.train import execute
 from hippo.core.settings import ConfigError
 
 ROOT = Path(__file__).parent.parent
@@ -159,6 +160,22 @@ def test_a_sweep_is_every_combination_with_every_seed_and_its_runs_are_those_tha
     assert plan["title"] == "Sweep lr, iterations=1, batch_size=400, env.horizon=100"
     assert {r["variant_label"] for r in plan["runs"]} >= {"hippo learning_rate=0.0001", "ppo learning_rate=0.001"}
     assert "python -m experiments.sweep compare lr" in capsys.readouterr().out.splitlines()[-1]
+
+
+def test_environments_of_gymnasium_are_swept_and_compared_as_others_are(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(sweep, "run_locally", lambda todo, *_: {run.run_id: execute(run) for run in todo})
+    monkeypatch.setattr(
+        "paper_figures.curves.draw", lambda results, out, **_: (out / "smoke").mkdir(parents=True, exist_ok=True) or []
+    )
+    arguments = ["--over", "env=gym:Pendulum-v1,gym:MountainCarContinuous-v0", "--over", "algo=ppo", *TINY]
+    assert run(tmp_path, "--name", "foreign", *arguments, "--seeds", "1") == 0
+    folders = [str(path.parent) for path in (tmp_path / "runs").glob("*/manifest.json")]
+    capsys.readouterr()
+    for targets in (["foreign"], folders):
+        assert run(tmp_path, *targets, "--out", str(tmp_path / "out"), action="compare") == 0
+        table = capsys.readouterr().out
+        assert "\ngym:Pendulum-v1" in table
+        assert "\ngym:MountainCarContinuous-v0" in table
 
 
 def test_a_file_says_the_same_as_the_command_line(tmp_path, begun):
