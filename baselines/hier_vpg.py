@@ -20,13 +20,21 @@ from torch import nn
 from hippo.core import seeding
 from hippo.core.advantages import Baselines, advantages
 from hippo.core.checkpoint import Checkpoint
-from hippo.core.hierarchy import HierarchicalPolicy, HierarchyConfig, collect, levels, policy_statistics, rollout
+from hippo.core.hierarchy import (
+    Acting,
+    HierarchicalPolicy,
+    HierarchyConfig,
+    collect,
+    levels,
+    policy_statistics,
+    restored,
+)
 from hippo.core.log import RunLog, check_finite
 from hippo.core.ppo import Level, chunks
 from hippo.core.settings import setting
 from hippo.core.skills import start_from
 
-__all__ = ["HierVPGConfig", "rollout", "train"]
+__all__ = ["Acting", "HierVPGConfig", "restored", "train"]
 
 REVISION = 1  # bumped by every change that alters the metrics of tests/golden
 

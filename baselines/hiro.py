@@ -15,7 +15,7 @@ Source: tensorflow/models, research/efficient-hrl at 052361de. docs/algorithms/h
 
 import dataclasses
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -34,7 +34,7 @@ from hippo.core.settings import MOST_STEPS, WIDEST, ConfigError, check, setting
 from hippo.core.skills import load_skills, policy_of
 from hippo.core.td3 import TD3
 
-__all__ = ["HiroConfig", "rollout", "train"]
+__all__ = ["Acting", "HiroConfig", "restored", "train"]
 
 REVISION = 1  # bumped by every change that alters the metrics of tests/golden
 
@@ -389,14 +389,51 @@ def clone(config: HiroConfig, agents: Agents, replay: Replay, seed: int) -> None
     agents.low.target_actor.load_state_dict(actor.state_dict())
 
 
-def rollout(config: HiroConfig, envs: Any, seed: int, checkpoint: Checkpoint, greedy: bool = False) -> Steps:
-    """One horizon of the trained policy in `envs`; `greedy` leaves the exploration out."""
+def restored(config: HiroConfig, envs: Any, checkpoint: Checkpoint) -> Agents:
+    """The agents of a checkpoint."""
     agents = make_agents(config, envs, 0)
     checkpoint.restore(agents=agents)
-    walk = Walk.begin(agents, envs, seed, 0, explores=not greedy)
-    for t in range(config.horizon):
-        walk.step(t, walk.act())
-    return walk.steps
+    return agents
+
+
+class Acting:
+    """Both levels at work, with their exploration unless `greedy` (`hippo.core.acting.Acting`)."""
+
+    def __init__(
+        self, agents: Agents, config: HiroConfig, num_envs: int, seed: int, iteration: int, greedy: bool = False
+    ) -> None:
+        self.agents, self.period = agents, config.period
+        self._generator = None if greedy else seeding.torch_generator(seed, "exploration", iteration)
+        self._age = torch.full((num_envs,), config.period)  # steps since the goal was set
+        self._done = torch.ones(num_envs, dtype=torch.bool)
+        self._obs: Tensor | None = None
+        self.goal = torch.zeros(num_envs, len(agents.goals.index))  # (N, k) in force
+
+    @property
+    def steps_left(self) -> np.ndarray:
+        """(N,) for how many more steps a goal is in force."""
+        return (self.period - self._age).numpy()
+
+    def _noise(self, size: Sequence[int]) -> Tensor | None:
+        return None if self._generator is None else torch.randn(tuple(size), generator=self._generator)
+
+    def act(self, obs: np.ndarray) -> np.ndarray:
+        """Actions (N, A) towards what remains of the goals, new ones where a period or an episode is over."""
+        agents, seen = self.agents, torch.from_numpy(obs.copy())
+        if self._obs is not None:
+            self.goal = agents.goals.transition(self._obs, self.goal, seen)
+        is_over = self._done | (self._age == self.period)
+        if is_over.any():
+            fresh = agents.new_goal(seen, self._noise(self.goal.shape))
+            self.goal = torch.where(is_over.unsqueeze(1), fresh, self.goal)
+            self._age[is_over] = 0
+        self._obs = seen
+        return agents.act(seen, self.goal, self._noise((len(seen), len(agents.low.unit)))).numpy()
+
+    def end(self, done: np.ndarray) -> None:
+        """One step has passed, and with it the episodes where `done` (N,)."""
+        self._done = torch.from_numpy(done.copy())
+        self._age += 1
 
 
 class Learner:

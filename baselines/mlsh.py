@@ -21,13 +21,14 @@ from hippo.core.advantages import Advantages, Baselines, advantages, masked_stan
 from hippo.core.checkpoint import Checkpoint
 from hippo.core.gae import segment_gae
 from hippo.core.hierarchy import (
+    Acting,
     Batch,
     HierarchicalPolicy,
     HierarchyConfig,
     collect,
     levels,
     policy_statistics,
-    rollout,
+    restored,
 )
 from hippo.core.log import RunLog, check_finite
 from hippo.core.minibatch import maximize_in_minibatches
@@ -37,7 +38,7 @@ from hippo.core.settings import ConfigError, setting
 from hippo.core.skills import start_from
 from hippo.core.value import ValueFunction, explained_variance
 
-__all__ = ["MLSHConfig", "rollout", "train"]
+__all__ = ["Acting", "MLSHConfig", "restored", "train"]
 
 REVISION = 1  # bumped by every change that alters the metrics of tests/golden
 

@@ -11,7 +11,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-import gymnasium as gym
 import torch
 from torch import Tensor, nn
 
@@ -22,7 +21,7 @@ from hippo.core.log import RunLog, check_finite
 from hippo.core.minibatch import maximize_in_minibatches, minibatches
 from hippo.core.networks import normalize_columns
 from hippo.core.normalize import standardize
-from hippo.core.options import Execution, OptionPolicy, Options
+from hippo.core.options import Acting, Execution, OptionPolicy, Options
 from hippo.core.policies import POLICY_HEAD, gaussian_entropy
 from hippo.core.ppo import Level, Rows, clipped_surrogate, in_chunks, surrogate_statistics
 from hippo.core.rollout import Steps
@@ -30,7 +29,7 @@ from hippo.core.settings import MOST_SKILLS, MOST_STEPS, WIDEST, ConfigError, ch
 from hippo.core.skills import start_from
 from hippo.core.value import explained_variance
 
-__all__ = ["OptionCriticConfig", "rollout", "train"]
+__all__ = ["Acting", "OptionCriticConfig", "restored", "train"]
 
 REVISION = 1  # bumped by every change that alters the metrics of tests/golden
 
@@ -209,31 +208,11 @@ def make_policy(config: OptionCriticConfig, envs: Any, generator: torch.Generato
     return policy
 
 
-def execution(
-    config: OptionCriticConfig,
-    policy: OptionPolicy,
-    envs: gym.vector.VectorEnv,
-    seed: int,
-    iteration: int,
-    greedy: bool = False,
-) -> Execution:
-    """One horizon about to be run, from fresh episodes; all randomness is named by (seed, iteration)."""
-    purposes = ("skills", "manager", "termination")
-    generators = {purpose: seeding.torch_generator(seed, purpose, iteration) for purpose in purposes}
-    result = Execution(policy, Steps(envs, config.horizon), generators, greedy)
-    result.start(seeding.integer(seed, "episodes", iteration))
-    return result
-
-
-def rollout(
-    config: OptionCriticConfig, envs: gym.vector.VectorEnv, seed: int, checkpoint: Checkpoint, greedy: bool = False
-) -> Steps:
-    """One horizon in every environment with the policy of a checkpoint; nothing is learnt."""
+def restored(config: OptionCriticConfig, envs: Any, checkpoint: Checkpoint) -> OptionPolicy:
+    """The policy of a checkpoint."""
     policy = make_policy(config, envs, seeding.torch_generator(0, "overwritten by the checkpoint"))
     checkpoint.restore(policy=policy)
-    run = execution(config, policy, envs, seed, 0, greedy)
-    run.run(0, config.horizon)
-    return run.steps
+    return policy
 
 
 def of_option(x: Tensor, option: Tensor) -> Tensor:
@@ -527,7 +506,7 @@ def train(config: OptionCriticConfig, make_envs: MakeEnvs, log: RunLog, seed: in
 
     for iteration in range(first, config.iterations):
         start, update_seconds = time.perf_counter(), 0.0
-        run = execution(config, policy, envs, seed, iteration)
+        run = Execution(policy, config, envs, seed, iteration)
         steps, generator = run.steps, seeding.torch_generator(seed, "minibatches", iteration)
         updates: list[dict[str, float]] = []
         for begin in range(0, config.horizon, config.steps_between_updates):

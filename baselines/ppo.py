@@ -56,6 +56,51 @@ class PPOConfig(SurrogateConfig):
             raise ConfigError("action_repeat", self.action_repeat, f"must be at most the horizon, {self.horizon} steps")
 
 
+class Acting:
+    """The policy at work (`hippo.core.acting.Acting`); with `greedy` it takes its mean action."""
+
+    def __init__(
+        self,
+        policy: GaussianPolicy,
+        config: PPOConfig,
+        num_envs: int,
+        seed: int,
+        iteration: int,
+        greedy: bool = False,
+    ) -> None:
+        self.config, self.greedy = config, greedy
+        self._shape = (config.horizon, num_envs, policy.log_std_parameter.shape[-1])
+        self._act, self._view = policy.actor(), actor_of(policy.filter)
+        self._action = torch.empty(self._shape[1:]).numpy()
+        self.steps_left = np.zeros(num_envs, np.int64)  # (N,) for which the action is held
+        self._draw(seed, iteration)
+
+    def _draw(self, seed: int, iteration: int) -> None:
+        self._seed, self._iteration, self._t = seed, iteration, 0
+        self._noise = torch.randn(self._shape, generator=seeding.torch_generator(seed, "policy", iteration)).numpy()
+        self._noise *= not self.greedy
+
+    def act(self, obs: np.ndarray) -> np.ndarray:
+        """Actions (N, A), new ones where none is held."""
+        if self._t == self.config.horizon:
+            self._draw(self._seed, self._iteration + 1)
+        seen, noise = self._view(obs), self._noise[self._t]
+        self.is_decision = self.steps_left == 0
+        where = np.flatnonzero(self.is_decision)
+        if len(where) == len(obs):  # at every step without action repeat
+            self._action = self._act(seen, noise)
+        elif len(where):
+            self._action[where] = self._act(seen[where], noise[where])
+        self.steps_left[where] = self.config.action_repeat
+        return self._action
+
+    def end(self, done: np.ndarray) -> None:
+        """One step has passed; an episode's end lets go of the action."""
+        self.steps_left -= 1
+        self.steps_left[done] = 0
+        self._t += 1
+
+
 @torch.no_grad()
 def collect(
     policy: GaussianPolicy,
@@ -74,25 +119,13 @@ def collect(
     """
     T, N = config.horizon, envs.num_envs
     steps = Steps(envs, T, config.bootstrap_horizon)
-    noise = torch.randn(steps.action.shape, generator=seeding.torch_generator(seed, "policy", iteration)).numpy()
-    noise *= not greedy
     is_decision = np.empty((T, N), bool)
-    action = torch.empty(steps.action.shape[1:]).numpy()
-    steps_left = np.zeros(N, np.int64)
-    act, view = policy.actor(), actor_of(policy.filter)
-    obs = view(steps.reset(seeding.integer(seed, "episodes", iteration)))
+    acting = Acting(policy, config, N, seed, iteration, greedy)
+    obs = steps.reset(seeding.integer(seed, "episodes", iteration))
     for t in range(T):
-        is_decision[t] = steps_left == 0
-        where = np.flatnonzero(is_decision[t])
-        if len(where) == N:  # at every step without action repeat
-            action = act(obs, noise[t])
-        elif len(where):
-            action[where] = act(obs[where], noise[t][where])
-        steps_left[where] = config.action_repeat
-        obs, done = steps.step(t, action)
-        obs = view(obs)
-        steps_left -= 1
-        steps_left[done] = 0
+        obs, done = steps.step(t, acting.act(obs))
+        is_decision[t] = acting.is_decision
+        acting.end(done)
     steps.see_through(policy.filter)
     return steps, torch.from_numpy(is_decision)
 
@@ -104,13 +137,11 @@ def make_policy(config: PPOConfig, envs: gym.vector.VectorEnv, generator: torch.
     return GaussianPolicy(obs_size, action_size, config.hidden_sizes, generator, *how)
 
 
-def rollout(
-    config: PPOConfig, envs: gym.vector.VectorEnv, seed: int, checkpoint: Checkpoint, greedy: bool = False
-) -> Steps:
-    """One horizon in every environment with the policy of a checkpoint; nothing is learnt."""
+def restored(config: PPOConfig, envs: Any, checkpoint: Checkpoint) -> GaussianPolicy:
+    """The policy of a checkpoint."""
     policy = make_policy(config, envs, seeding.torch_generator(0, "overwritten by the checkpoint"))
     checkpoint.restore(policy=policy)
-    return collect(policy, envs, config, seed, 0, greedy)[0]
+    return policy
 
 
 def train(config: PPOConfig, make_envs: MakeEnvs, log: RunLog, seed: int, checkpoint: Checkpoint) -> None:

@@ -26,13 +26,14 @@ from experiments.bench_measure import (
     rate,
     stepping,
 )
-from experiments.config import algorithm, compose_run
+from experiments.config import compose_run
 from experiments.train import prepare
 from hippo.core.advantages import Baselines
 from hippo.core.checkpoint import Checkpoint
 from hippo.core.log import Row as LogRow
 from hippo.core.log import RunLog
 from hippo.core.value import ValueFunction
+from hippo.learners import learner_of
 
 ROUNDS = {"ant_gather": 3, "snake_gather": 3, "block_hopper": 7, "block_half_cheetah": 7}  # after a warm-up
 ENVIRONMENTS = tuple(ROUNDS)
@@ -74,7 +75,7 @@ def training(overrides: Sequence[str], report: Callable[[Iteration], None]) -> N
 
     with tempfile.TemporaryDirectory() as folder:
         log, checkpoint = RunLog(Path(folder), on_row), Checkpoint(Path(folder))
-        algorithm(run.algo).train(run.config, prepare(run), log, run.seed, checkpoint)
+        learner_of(run.algo).train(run.config, prepare(run), log, run.seed, checkpoint)
 
 
 def _clocked(algo: str) -> dict[str, Span]:

@@ -18,12 +18,13 @@ import torch
 
 from experiments.bench_environments import registered
 from experiments.bench_measure import Row, contestants, one_core
-from experiments.config import algorithm, compose_run
+from experiments.config import compose_run
 from experiments.train import prepare
 from hippo.core.checkpoint import Checkpoint
 from hippo.core.log import Row as LogRow
 from hippo.core.log import RunLog
 from hippo.envs import gymnasium_id
+from hippo.learners import learner_of
 
 GOALS = {"block_hopper": 5.0, "block_half_cheetah": 2.0}  # walls, whose time is taken
 BUDGET, MARKS = 1_000_000, (300_000, 500_000, 1_000_000)  # environment steps
@@ -57,7 +58,7 @@ def ours(overrides: Sequence[str], report: Report) -> None:
 
     with tempfile.TemporaryDirectory() as folder:
         log, checkpoint = RunLog(Path(folder), on_row), Checkpoint(Path(folder))
-        algorithm(run.algo).train(run.config, prepare(run), log, run.seed, checkpoint)
+        learner_of(run.algo).train(run.config, prepare(run), log, run.seed, checkpoint)
 
 
 def stable_baselines(name: str, seed: int, report: Report) -> None:

@@ -5,7 +5,6 @@ import dataclasses
 import difflib
 import functools
 import hashlib
-import importlib
 import json
 import operator
 import re
@@ -29,20 +28,10 @@ from hippo.core.settings import ConfigError, setting
 from hippo.core.skills import SkillsError, read_skills
 from hippo.envs import ENVIRONMENTS, environment, foreign
 from hippo.envs.registration import Options, check_options, option
+from hippo.learners import LEARNERS, config_class, learner_of
 
 CONF = Path(__file__).parent / "conf"
 COMMITTED = Path(__file__).parent.parent / "paper_figures" / "data"
-# name -> (module, config class); a module holds the config, REVISION and train
-ALGORITHMS = {
-    "hippo": ("hippo.hippo", "HippoConfig"),
-    "ppo": ("baselines.ppo", "PPOConfig"),
-    "hier_vpg": ("baselines.hier_vpg", "HierVPGConfig"),
-    "snn": ("baselines.snn", "SNNConfig"),
-    "diayn": ("baselines.diayn", "DIAYNConfig"),
-    "mlsh": ("baselines.mlsh", "MLSHConfig"),
-    "option_critic": ("baselines.option_critic", "OptionCriticConfig"),
-    "hiro": ("baselines.hiro", "HiroConfig"),
-}
 # The groups of conf/ that a run chooses from, and what it chooses when nothing is said.
 GROUPS = {"env": "block_hopper", "algo": "hippo", "scale": "paper", "protocol": "paper"}
 BUDGET_FIELDS = ("iterations", "batch_size", "horizon")
@@ -224,7 +213,7 @@ class Run:
         return (
             {
                 "algo": self.algo,
-                "algo_revision": algorithm(self.algo).REVISION,
+                "algo_revision": learner_of(self.algo).REVISION,
                 "settings": settings,
                 "env": self.env,
                 "env_revision": environment(self.env).revision,
@@ -272,7 +261,7 @@ class Run:
         """
         try:
             plain = yaml.safe_load(text)
-            check_choice("algo", plain["algo"], tuple(ALGORITHMS))
+            check_choice("algo", plain["algo"], tuple(LEARNERS))
             _check_group("env", plain["env"])
             check_choice("kind", plain["kind"], KINDS)
             for key, kind in {"seed": int, "options": dict, "config": dict, "scale": str}.items():
@@ -302,16 +291,6 @@ def default_of(f: dataclasses.Field) -> Any:
     return f.default_factory() if f.default_factory is not dataclasses.MISSING else f.default
 
 
-def algorithm(name: str) -> Any:
-    """The module of an algorithm, imported when it is needed."""
-    return importlib.import_module(ALGORITHMS[name][0])
-
-
-def config_class(name: str) -> Any:
-    """The config dataclass of an algorithm."""
-    return getattr(algorithm(name), ALGORITHMS[name][1])
-
-
 def choices(group: str) -> list[str]:
     """The files of one group of conf/, e.g. the scales."""
     return sorted(path.stem for path in (CONF / group).glob("*.yaml"))
@@ -337,7 +316,7 @@ def _register() -> None:
     store = ConfigStore.instance()
     store.store(name="run_schema", node=RunSchema)
     store.store(group="env", name="env_schema", node=EnvConfig)
-    for name in ALGORITHMS:
+    for name in LEARNERS:
         store.store(group="algo", name=f"{name}_schema", node=config_class(name))
 
 
@@ -427,7 +406,7 @@ def group_choices(group: str) -> list[str]:
     """The values of env, algo, scale or protocol."""
     if group == "env":
         return [name if name in ENVIRONMENTS else f"{foreign.PREFIX}<id>" for name in choices(group)]
-    return list(ALGORITHMS) if group == "algo" else choices(group)
+    return list(LEARNERS) if group == "algo" else choices(group)
 
 
 def _check_group(group: str, value: str) -> str:

@@ -16,12 +16,13 @@ from typing import Any
 
 import torch
 
-from experiments.config import Run, algorithm, installed
+from experiments.config import Run, installed
 from experiments.status import write_atomically
 from experiments.train import prepare
 from hippo.core.checkpoint import Checkpoint
 from hippo.core.files import DamagedFile, read_json
 from hippo.core.log import RunLog
+from hippo.learners import learner_of
 
 REFERENCE = Path(__file__).with_name("reference_costs.json")  # committed; experiments.cost_table --measure writes it
 STEPS, ITERATIONS = 200, 3  # of the short training, per environment; its first iteration warms up and does not count
@@ -45,7 +46,7 @@ def cache_file() -> Path:
 def key(run: Run) -> str:
     """What the cost of a step depends on."""
     cpu = hashlib.sha256(cpu_name().encode()).hexdigest()[:8]
-    revision = algorithm(run.algo).REVISION
+    revision = learner_of(run.algo).REVISION
     versions = f"torch-{installed('torch')} mujoco-{installed('mujoco')} cpu-{cpu}"
     return kind(run).replace(run.algo, f"{run.algo}-{revision}", 1) + f" {versions}"
 
@@ -155,7 +156,7 @@ def measure(run: Run) -> Cost:
     threads = torch.get_num_threads()
     with tempfile.TemporaryDirectory() as folder:
         log = RunLog(Path(folder), lambda metrics, timing: ends.append(time.perf_counter()))
-        algorithm(run.algo).train(short.config, prepare(short), log, run.seed, Checkpoint(Path(folder)))
+        learner_of(run.algo).train(short.config, prepare(short), log, run.seed, Checkpoint(Path(folder)))
         sizes = {path.name: path.stat().st_size for path in Path(folder).iterdir()}
     torch.set_num_threads(threads)
     fastest = min(b - a for a, b in itertools.pairwise(ends))

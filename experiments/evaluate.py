@@ -23,16 +23,18 @@ from scipy import stats
 
 from experiments import crossings
 from experiments.command_line import Parser, bad_input, check_writable, run_command
-from experiments.config import Run, algorithm
+from experiments.config import Run
 from experiments.crossings import Crossings, has_walls
 from experiments.manifest import changed_identity, stated
 from experiments.status import read_status, write_atomically
 from hippo.core import seeding
+from hippo.core.acting import rollout
 from hippo.core.checkpoint import Checkpoint, CheckpointError
 from hippo.core.episodes import opening_episodes
 from hippo.core.settings import ConfigError
 from hippo.envs import foreign, make
 from hippo.envs.registration import Options
+from hippo.learners import learner_of
 
 COLUMNS = (
     "run_id",
@@ -138,7 +140,7 @@ def evaluate(run: Run, episodes: int, seed: int, greedy: bool = False, **changes
     if has_walls(envs):
         envs = Crossings(envs)
     streams = seeding.integer(seed, "evaluation of a policy")
-    steps = algorithm(run.algo).rollout(run.restored_config, envs, streams, trained(run), greedy)
+    steps = rollout(learner_of(run.algo), run.restored_config, envs, streams, trained(run), greedy)
     returns, lengths = opening_episodes(steps.reward.numpy(), steps.done.numpy())
     common = {
         "run_id": name_of(run),

@@ -13,10 +13,10 @@ from pathlib import Path
 from experiments.command_line import Parser, bad_input, run_command
 from experiments.evaluate import load_finished_run, name_of
 from hippo.core import checkpoint
+from hippo.core.acting import parts_that_act
 from hippo.core.checkpoint import CheckpointError
 from hippo.core.settings import ConfigError
 
-ACTING = ("policy", "agents")  # the parts of a checkpoint that a learner's `rollout` restores
 COPIED = ("config.yaml", "manifest.json")
 
 
@@ -27,8 +27,7 @@ def export(folder: Path, target: Path) -> Path:
         ConfigError: `folder` is no run's, or its run is not finished. CheckpointError: its checkpoint is damaged.
     """
     run = load_finished_run(folder)
-    content = checkpoint.load(folder / "checkpoint.pt")
-    kept = {name: part for name, part in content.items() if name in ("iteration", "run_id", *ACTING)}
+    kept = parts_that_act(folder / "checkpoint.pt")
     place = target / name_of(run)
     place.mkdir(parents=True, exist_ok=True)
     for name in COPIED:

@@ -11,7 +11,8 @@ import io
 from pathlib import Path
 
 from experiments.command_line import run_command
-from experiments.config import ALGORITHMS, config_class, default_of
+from experiments.config import default_of
+from hippo.learners import LEARNERS, config_class
 
 DOCS = Path(__file__).parent.parent / "docs"
 COLUMNS = ("algorithm", "setting", "default", "meaning", "paper", "authors_code", "ours")
@@ -26,7 +27,7 @@ where both are, ours. An empty default is filled in by the scale (`experiments/c
 def rows() -> list[dict[str, str]]:
     """One row per algorithm and setting."""
     table = []
-    for name in ALGORITHMS:
+    for name in LEARNERS:
         for field in dataclasses.fields(config_class(name)):
             default, source = default_of(field), field.metadata
             values = (
@@ -54,7 +55,7 @@ def as_csv() -> str:
 def as_markdown() -> str:
     """The table as a page, a section per algorithm."""
     lines = [INTRODUCTION]
-    for name in ALGORITHMS:
+    for name in LEARNERS:
         lines += [
             f"\n## {name}\n",
             "| setting | default | meaning | paper | authors' code | ours |",

@@ -28,7 +28,7 @@ from filelock import Timeout
 
 from experiments import usage
 from experiments.command_line import EXIT_DIVERGED, EXIT_FAILED, EXIT_REQUEUE, Parser, bad_input, clock, run_command
-from experiments.config import PRETRAINED, Run, algorithm, committed_skills, compose_run, unquoted
+from experiments.config import PRETRAINED, Run, committed_skills, compose_run, unquoted
 from experiments.console import unattended
 from experiments.evaluate import as_csv, evaluate_all
 from experiments.manifest import from_manifest, manifest_with_history
@@ -53,6 +53,7 @@ from hippo.core.settings import ConfigError
 from hippo.core.skills import SkillsError, save_skills
 from hippo.envs import make
 from hippo.envs.foreign import EnvironmentFault
+from hippo.learners import learner_of
 
 EXIT_CODES = {"finished": 0, "running": 0, "failed": EXIT_FAILED, "diverged": EXIT_DIVERGED, "preempted": EXIT_REQUEUE}
 
@@ -238,14 +239,14 @@ def train(run: Run, status: Status) -> None:
 
     log = RunLog(run.folder, on_row)
     saved = Checkpoint(run.folder, run.run_id, log)
-    algorithm(run.algo).train(with_skills(run), make_envs, log, run.seed, saved)
+    learner_of(run.algo).train(with_skills(run), make_envs, log, run.seed, saved)
     log.check_whole(run.config.iterations)
 
 
 def pretrain(run: Run, status: Status) -> None:
     """Train skills and write them to skills.pt."""
     train(run, status)
-    policy, metadata = algorithm(run.algo).skills(run.config, prepare(run), Checkpoint(run.folder, run.run_id))
+    policy, metadata = learner_of(run.algo).skills(run.config, prepare(run), Checkpoint(run.folder, run.run_id))
     save_skills(run.folder / "skills.pt", policy, metadata | {"run_id": run.run_id})
 
 

@@ -17,13 +17,15 @@ import numpy as np
 import torch
 
 from experiments.command_line import EXIT_FAILED, Parser, bad_input, clock, run_command
-from experiments.config import Run, algorithm
+from experiments.config import Run
 from experiments.evaluate import environments, in_flags, load_run, trained
 from hippo.core import seeding
+from hippo.core.acting import rollout
 from hippo.core.checkpoint import CheckpointError
 from hippo.core.settings import ConfigError
 from hippo.envs.rendering import NoOpenGL, Renderer
 from hippo.envs.vector import RobotTaskEnv
+from hippo.learners import learner_of
 
 FRAMES_PER_SECOND = 25
 
@@ -82,7 +84,7 @@ def record(run: Run, path: Path, seed: int, greedy: bool, **changes: Any) -> flo
     with streamed(path) as write:
         recorded = Recorded(envs, write)
         streams = seeding.integer(seed, "evaluation of a policy")
-        steps = algorithm(run.algo).rollout(run.restored_config, recorded, streams, trained(run), greedy)
+        steps = rollout(learner_of(run.algo), run.restored_config, recorded, streams, trained(run), greedy)
     end = int(steps.done[:, 0].nonzero()[0]) + 1
     return float(steps.reward[:end, 0].sum())
 

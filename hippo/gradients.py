@@ -24,7 +24,7 @@ from hippo.core import seeding
 from hippo.core.advantages import Baselines, advantages
 from hippo.core.checkpoint import Checkpoint
 from hippo.core.gae import gae
-from hippo.core.hierarchy import Batch, HierarchicalPolicy, HierarchyConfig, collect, levels, restored_policy
+from hippo.core.hierarchy import Batch, HierarchicalPolicy, HierarchyConfig, collect, levels, restored
 from hippo.core.policies import gaussian_log_prob
 from hippo.core.ppo import CHUNK, chunks
 
@@ -313,7 +313,7 @@ def measure(
         `cosine_similarities`, `skill_separation` and `baseline_variances`.
     """
     envs = make_envs(config.num_envs, "training")
-    policy = restored_policy(config, envs, checkpoint)
+    policy = restored(config, envs, checkpoint)
     baselines, iteration = restored_baselines(config, envs, checkpoint)
     batch = collect(policy, envs, config, seed, iteration)
     batch.steps.scale_rewards(baselines.reward_scale, config.gamma, frozen=True)

@@ -13,10 +13,10 @@ from analysis import claims, report
 from analysis.command_line import PROTOCOLS, SCALES
 from experiments import sweep, synonyms, train
 from experiments.config import (
-    ALGORITHMS,
     BUDGET_FIELDS,
     COMMITTED,
     GROUPS,
+    LEARNERS,
     PLAIN_TEXT,
     PRETRAINING,
     Run,
@@ -158,7 +158,7 @@ def test_a_word_of_another_library_leads_to_ours(typed, said):
 
 
 def test_every_key_that_a_synonym_leads_to_exists():
-    runs = [compose_run([f"algo={algo}"]) for algo in ALGORITHMS]
+    runs = [compose_run([f"algo={algo}"]) for algo in LEARNERS]
     known = {f"algo.{f.name}" for run in runs for f in dataclasses.fields(run.config)}
     known |= {*GROUPS, *PLAIN_TEXT, "iterations", "batch_size", "seed", "env.horizon", "wandb.mode"}
     assert {key for keys in synonyms.KEYS.values() for key in keys} <= known
@@ -180,7 +180,7 @@ def test_a_robot_alone_says_whether_it_is_paid(name):
 CHOSEN = {"hiro": "ant_gather", "diayn": "hopper"}  # algorithm -> environment, where not every one will do
 
 
-@pytest.mark.parametrize("algo", ALGORITHMS)
+@pytest.mark.parametrize("algo", LEARNERS)
 def test_help_lists_every_key_with_a_value_that_may_be_typed_and_its_meaning(algo, capsys):
     chosen = [f"algo={algo}", f"env={CHOSEN.get(algo, 'snake_gather')}", "scale=laptop"]
     assert train.main([*chosen, "--help"]) == 0

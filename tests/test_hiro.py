@@ -9,6 +9,7 @@ from torch import nn
 
 from baselines import hiro
 from baselines.hiro import Agents, HiroConfig, Walk
+from hippo.core.acting import rollout
 from hippo.core.checkpoint import Checkpoint
 from hippo.core.goals import BODY_GOALS, Goals, Memory, candidate_goals
 from hippo.core.log import RunLog
@@ -443,9 +444,9 @@ def test_updates_keep_their_ratio_to_steps_across_iterations_and_the_last_checkp
 def test_a_rollout_of_a_trained_run_repeats_itself_and_greedy_leaves_the_noise_out(tmp_path):
     config = small()
     train_point(tmp_path, config)
-    noisy = [hiro.rollout(config, PointMass(4, 0, 20), 3, Checkpoint(tmp_path)).action for _ in range(2)]
+    noisy = [rollout(hiro, config, PointMass(4, 0, 20), 3, Checkpoint(tmp_path)).action for _ in range(2)]
     assert torch.equal(*noisy)
-    greedy = hiro.rollout(config, PointMass(4, 0, 20), 3, Checkpoint(tmp_path), greedy=True)
+    greedy = rollout(hiro, config, PointMass(4, 0, 20), 3, Checkpoint(tmp_path), greedy=True)
     assert not torch.equal(noisy[0], greedy.action)
     assert greedy.done[-1].all()
 
@@ -595,7 +596,7 @@ def test_hiro_gets_through_a_short_corridor_flat_td3_is_printed_beside_it(tmp_pa
         manager_reward_scale=1.0,
     )
     train_point(tmp_path / "hiro", config)
-    steps = hiro.rollout(config, PointMass(100, 1, 40), 1, Checkpoint(tmp_path / "hiro"), greedy=True)
+    steps = rollout(hiro, config, PointMass(100, 1, 40), 1, Checkpoint(tmp_path / "hiro"), greedy=True)
     hierarchical = success(steps)
 
     flat, envs, rng = td3(2, 2, gamma=0.99), PointMass(10, 0, 40), generator(7)

@@ -12,6 +12,7 @@ from baselines import mlsh
 from hippo import envs as robot_envs
 from hippo import hippo
 from hippo.core import seeding
+from hippo.core.acting import rollout
 from hippo.core.advantages import Baselines, advantages
 from hippo.core.checkpoint import Checkpoint, load
 from hippo.core.gae import gae, segment_gae
@@ -286,7 +287,7 @@ def test_a_trained_hierarchy_is_evaluated_without_exploration_and_in_random_conf
     run(mlsh.train, config, tmp_path)
     envs = Recorder(10, 3)
     envs.notes, envs.layout = [], None
-    greedy = [mlsh.rollout(config, envs, 1, Checkpoint(tmp_path), greedy=True) for _ in range(2)]
+    greedy = [rollout(mlsh, config, envs, 1, Checkpoint(tmp_path), greedy=True) for _ in range(2)]
     assert torch.equal(greedy[0].action, greedy[1].action)
     assert envs.notes == [None, None]
     trained = policy_of(config)

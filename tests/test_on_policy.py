@@ -12,9 +12,10 @@ from experiments.config import compose_run
 from experiments.evaluate import main as evaluate_main
 from hippo import gradients, hippo
 from hippo.core import seeding
+from hippo.core.acting import rollout
 from hippo.core.advantages import Baselines, advantages
 from hippo.core.checkpoint import Checkpoint, CheckpointError, load, save
-from hippo.core.hierarchy import HierarchicalPolicy, collect, levels, restored_policy, rows_by_skill
+from hippo.core.hierarchy import HierarchicalPolicy, collect, levels, restored, rows_by_skill
 from hippo.core.minibatch import minibatches
 from hippo.core.networks import SkillLinear, mlp, normalize_columns
 from hippo.core.normalize import ObservationFilter, RewardScale, RunningMoments
@@ -86,25 +87,26 @@ def test_rewards_that_are_all_zero_stay_zero():
 
 
 @pytest.mark.parametrize(("learner", "config"), [(hippo, hippo_config()), (ppo, ppo_config())])
-def test_a_restored_policy_acts_as_the_one_in_memory_and_acting_leaves_its_statistics_alone(learner, config, tmp_path):
+def test_a_restored_acts_as_the_one_in_memory_and_acting_leaves_its_statistics_alone(learner, config, tmp_path):
     run(learner.train, config, tmp_path)
     before = (tmp_path / "checkpoint.pt").read_bytes()
     state = load(tmp_path / "checkpoint.pt")["policy"]
     assert float(state["filter.count"]) == 3 * 400
     # What acted in memory: the same networks, with the statistics written out by hand.
     envs = TargetEnv(5, 3)
-    steps = learner.rollout(config, envs, 1, Checkpoint(tmp_path), greedy=True)
+    steps = rollout(learner, config, envs, 1, Checkpoint(tmp_path), greedy=True)
     scale = state["filter.variance"].sqrt().clamp(min=0.1)
-    seen = ((steps.raw_obs.double() - state["filter.mean"]) / scale).clamp(-5, 5)
-    torch.testing.assert_close(steps.obs.double(), seen, rtol=1e-5, atol=1e-5)
-    again = learner.rollout(config, TargetEnv(5, 3), 1, Checkpoint(tmp_path), greedy=True)
+    seen = ((steps.obs.double() - state["filter.mean"]) / scale).clamp(-5, 5)
+    view = learner.restored(config, envs, Checkpoint(tmp_path)).filter
+    torch.testing.assert_close(view(steps.obs).double(), seen, rtol=1e-5, atol=1e-5)
+    again = rollout(learner, config, TargetEnv(5, 3), 1, Checkpoint(tmp_path), greedy=True)
     assert torch.equal(again.action, steps.action)
     assert (tmp_path / "checkpoint.pt").read_bytes() == before
     # The wrong variant, statistics that go on being updated, would be seen in the actions.
     state["filter.mean"] += 0.1
     (tmp_path / "wrong").mkdir()
     save(tmp_path / "wrong" / "checkpoint.pt", load(tmp_path / "checkpoint.pt") | {"policy": state})
-    wrong = learner.rollout(config, TargetEnv(5, 3), 1, Checkpoint(tmp_path / "wrong"), greedy=True)
+    wrong = rollout(learner, config, TargetEnv(5, 3), 1, Checkpoint(tmp_path / "wrong"), greedy=True)
     assert not torch.equal(wrong.action, steps.action)
 
 
@@ -124,7 +126,7 @@ def test_a_measurement_scales_rewards_as_training_did_and_leaves_the_scale_alone
     run(hippo.train, config, tmp_path)
     baselines, iteration = gradients.restored_baselines(config, TargetEnv(1, 0), Checkpoint(tmp_path))
     assert iteration == 3
-    policy = restored_policy(config, TargetEnv(1, 0), Checkpoint(tmp_path))
+    policy = restored(config, TargetEnv(1, 0), Checkpoint(tmp_path))
     steps = collect(policy, TargetEnv(20, 0), config, 0, iteration).steps
     variance = float(load(tmp_path / "checkpoint.pt")["baselines"]["reward_scale.variance"])
     steps.scale_rewards(baselines.reward_scale, config.gamma, frozen=True)
@@ -300,11 +302,11 @@ def test_a_checkpoint_without_its_statistics_or_of_the_other_protocol_is_refused
     without = {key: value for key, value in content["policy"].items() if not key.startswith("filter.")}
     save(tmp_path / "checkpoint.pt", content | {"policy": without})
     with pytest.raises(CheckpointError, match=r"not of this run's settings: policy: .*filter\.count"):
-        restored_policy(config, TargetEnv(1, 0), Checkpoint(tmp_path))
+        restored(config, TargetEnv(1, 0), Checkpoint(tmp_path))
     save(tmp_path / "checkpoint.pt", content)
     paper = hippo.HippoConfig(**BUDGET, num_skills=3, period_min=2, period_max=6)
     with pytest.raises(CheckpointError, match=r"not of this run's settings: policy: .*filter\.count"):
-        restored_policy(paper, TargetEnv(1, 0), Checkpoint(tmp_path))
+        restored(paper, TargetEnv(1, 0), Checkpoint(tmp_path))
     made = compose_run(["protocol=modern", "scale=smoke", f"runs_dir={tmp_path}"])
     made.folder.mkdir()
     (made.folder / "config.yaml").write_text(made.to_yaml())

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from baselines import option_critic as oc
+from hippo.core.acting import rollout
 from hippo.core.checkpoint import Checkpoint, load
 from hippo.core.gae import gae
 from hippo.core.minibatch import minibatches
@@ -32,7 +33,7 @@ def experience(config, seed=0, death_rate=0.0, policy=None):
     """A fresh policy, and what it did for one horizon."""
     envs = TargetEnv(config.num_envs, seed, horizon=config.horizon, death_rate=death_rate)
     policy = policy or oc.make_policy(config, envs, torch.Generator().manual_seed(seed))
-    execution = oc.execution(config, policy, envs, seed, 0)
+    execution = oc.Execution(policy, config, envs, seed, 0)
     execution.run(0, config.horizon)
     return policy, execution.steps, execution.options
 
@@ -208,7 +209,7 @@ def test_portions_of_a_horizon_without_updates_in_between_are_the_horizon_at_onc
     config = config_of()
     policy, steps, options = experience(config, death_rate=0.05)
     envs = TargetEnv(config.num_envs, 0, horizon=20, death_rate=0.05)
-    execution = oc.execution(config, policy, envs, 0, 0)
+    execution = oc.Execution(policy, config, envs, 0, 0)
     for first, last in ((0, 7), (7, 8), (8, 20)):
         execution.run(first, last)
     assert torch.equal(execution.steps.action, steps.action)
@@ -220,11 +221,11 @@ def test_greedy_execution_repeats_itself_and_ends_options_above_one_half(tmp_pat
     config = config_of(batch_size=400)
     run(oc.train, config, tmp_path)
     returns = [
-        oc.rollout(config, TargetEnv(4, 5), seed, Checkpoint(tmp_path), greedy=True).reward.sum() for seed in (1, 1)
+        rollout(oc, config, TargetEnv(4, 5), seed, Checkpoint(tmp_path), greedy=True).reward.sum() for seed in (1, 1)
     ]
     assert returns[0] == returns[1]
     policy = oc.make_policy(config, TargetEnv(4, 5), torch.Generator().manual_seed(0))
-    execution = oc.execution(config, policy, TargetEnv(4, 5), 0, 0, greedy=True)
+    execution = oc.Execution(policy, config, TargetEnv(4, 5), 0, 0, greedy=True)
     execution.run(0, 20)
     with torch.no_grad():
         beta = oc.of_option(policy.beta(execution.steps.obs)[1:], execution.options.option[:-1])

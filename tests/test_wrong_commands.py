@@ -6,7 +6,7 @@ import shutil
 
 import pytest
 
-from experiments.config import ALGORITHMS, config_class
+from hippo.learners import LEARNERS, config_class
 
 COMMANDS = {
     "experiments.sweep": ["run", "fig3"],
@@ -44,7 +44,7 @@ def wrong_commands():
                 continue
             more = ["--launcher", "slurm"] if option == "--profile" else []
             yield from ((module, [*start, *more, f"{option}={value}"]) for value in values)
-    for algo in ALGORITHMS:
+    for algo in LEARNERS:
         for field in dataclasses.fields(config_class(algo)):
             if "low" in field.metadata and field.metadata["low"] is not None:
                 yield "experiments.train", [f"algo={algo}", "scale=smoke", f"algo.{field.name}=-1"]

@@ -229,6 +229,72 @@ class Batch:
     used: Tensor  # (T, N) is learnt from; all true unless truncate_to_period
 
 
+class Acting:
+    """Algorithm 1 without its learning: the hierarchy at work (`hippo.core.acting.Acting`).
+
+    Periods, the manager's uniforms and the skills' Gaussian noise have a stream each, so what one level draws never
+    shifts what the other draws. With `greedy` both levels take their most likely choice.
+    """
+
+    def __init__(
+        self,
+        policy: HierarchicalPolicy,
+        config: HierarchyConfig,
+        num_envs: int,
+        seed: int,
+        iteration: int,
+        greedy: bool = False,
+    ) -> None:
+        self.policy, self.config, self.greedy = policy, config, greedy
+        self.commitment = Commitment(policy, num_envs, config.period_max)
+        self._skills, self._view, self._everywhere = policy.skills.actor(), actor_of(policy.filter), np.arange(num_envs)
+        self._draw(seed, iteration)
+
+    def _draw(self, seed: int, iteration: int) -> None:
+        """The randomness of a horizon of T steps; T + 1 rows of what is decided before a step."""
+        self._seed, self._iteration, self.t = seed, iteration, 0
+        (T, N), config = (self.config.horizon, len(self._everywhere)), self.config
+        generator = seeding.torch_generator(seed, "period", iteration)
+        self._period = torch.randint(config.period_min, config.period_max + 1, (T + 1, N), generator=generator).numpy()
+        self._uniform = torch.rand(T + 1, N, generator=seeding.torch_generator(seed, "manager", iteration)).numpy()
+        shape = (T, N, self.policy.skills.log_std_parameter.shape[-1])
+        self._noise = torch.randn(shape, generator=seeding.torch_generator(seed, "skills", iteration)).numpy()
+        self._noise *= not self.greedy
+
+    @property
+    def skill(self) -> np.ndarray:
+        """(N,) the skill in force."""
+        return self.commitment.skill
+
+    @property
+    def steps_left(self) -> np.ndarray:
+        """(N,) for how many more steps."""
+        return self.commitment.steps_left
+
+    def decide(self, obs: np.ndarray) -> np.ndarray:
+        """See `obs` (N, D), and choose a skill where a commitment has run out; returns where, (N,) bool."""
+        self._seen = self._view(obs)
+        return self.commitment.renew(self._seen, self._period[self.t], None if self.greedy else self._uniform[self.t])
+
+    def action(self) -> np.ndarray:
+        """What the skills in force do (N, A) about what was last seen."""
+        policy, time_left = self.policy, self.commitment.time_left
+        seen = look(self._seen, time_left, self._everywhere, policy.skill_view, policy.sees_time)
+        return self._skills(seen, self.skill, self._noise[self.t])
+
+    def act(self, obs: np.ndarray) -> np.ndarray:
+        """Decide and act."""
+        if self.t == self.config.horizon:
+            self._draw(self._seed, self._iteration + 1)
+        self.decide(obs)
+        return self.action()
+
+    def end(self, done: np.ndarray) -> None:
+        """One step has passed; an episode's end cuts the commitment."""
+        self.commitment.advance(done)
+        self.t += 1
+
+
 @torch.no_grad()
 def collect(
     policy: HierarchicalPolicy,
@@ -240,32 +306,22 @@ def collect(
 ) -> Batch:
     """Algorithm 1 in every environment, for one horizon from a fresh episode.
 
-    With `greedy` both levels take their most likely choice. All randomness is drawn up front from streams named by
-    (seed, iteration): periods, the manager's uniforms and the skills' Gaussian noise, so what one level draws never
-    shifts what the other draws.
+    With `greedy` both levels take their most likely choice. All randomness is named by (seed, iteration).
     """
     T, N = config.horizon, envs.num_envs
     steps = Steps(envs, T, config.bootstrap_horizon)
-    generator = seeding.torch_generator(seed, "period", iteration)
-    period = torch.randint(config.period_min, config.period_max + 1, (T + 1, N), generator=generator).numpy()
-    uniform = torch.rand(T + 1, N, generator=seeding.torch_generator(seed, "manager", iteration)).numpy()
-    noise = torch.randn(steps.action.shape, generator=seeding.torch_generator(seed, "skills", iteration)).numpy()
-    noise *= not greedy
     skill = np.empty((T + 1, N), np.int64)
     time_left = torch.empty(T + 1, N).numpy()
     is_decision = np.empty((T + 1, N), bool)
 
-    act, view, everywhere = policy.skills.actor(), actor_of(policy.filter), np.arange(N)
-    commitment = Commitment(policy, N, config.period_max)
-    obs = view(steps.reset(seeding.integer(seed, "episodes", iteration)))
+    acting = Acting(policy, config, N, seed, iteration, greedy)
+    obs = steps.reset(seeding.integer(seed, "episodes", iteration))
     for t in range(T + 1):
-        is_decision[t] = commitment.renew(obs, period[t], None if greedy else uniform[t])
-        skill[t], time_left[t] = commitment.skill, commitment.time_left
+        is_decision[t] = acting.decide(obs)
+        skill[t], time_left[t] = acting.skill, acting.commitment.time_left
         if t < T:
-            seen = look(obs, commitment.time_left, everywhere, policy.skill_view, policy.sees_time)
-            obs, done = steps.step(t, act(seen, skill[t], noise[t]))
-            obs = view(obs)
-            commitment.advance(done)
+            obs, done = steps.step(t, acting.action())
+            acting.end(done)
     steps.see_through(policy.filter)
 
     decisions, used = torch.from_numpy(is_decision), torch.ones_like(steps.done)
@@ -274,14 +330,7 @@ def collect(
     return Batch(steps, torch.from_numpy(skill), torch.from_numpy(time_left), decisions, used)
 
 
-def rollout(
-    config: HierarchyConfig, envs: gym.vector.VectorEnv, seed: int, checkpoint: Checkpoint, greedy: bool = False
-) -> Steps:
-    """One horizon in every environment with the policy of a checkpoint; nothing is learnt."""
-    return collect(restored_policy(config, envs, checkpoint), envs, config, seed, 0, greedy).steps
-
-
-def restored_policy(config: HierarchyConfig, envs: Any, checkpoint: Checkpoint) -> HierarchicalPolicy:
+def restored(config: HierarchyConfig, envs: Any, checkpoint: Checkpoint) -> HierarchicalPolicy:
     """The policy of a checkpoint."""
     obs_size, action_size = envs.single_observation_space.shape[0], envs.single_action_space.shape[0]
     generator = seeding.torch_generator(0, "overwritten by the checkpoint")

@@ -6,11 +6,13 @@ at; then the policy over options pi_Omega(o|s) chooses the next. Q(s, o) values 
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
+from hippo.core import seeding
 from hippo.core.networks import for_few_rows, mlp
 from hippo.core.normalize import ObservationFilter
 from hippo.core.policies import Manager, SkillPolicy, sample_categorical
@@ -72,23 +74,86 @@ class Options:
     begins: Tensor  # (T + 1, N) bool, an episode begins here
 
 
-class Execution:
-    """Call-and-return in N environments for T steps, in portions between which the policy may change."""
+class Acting:
+    """Call-and-return in N environments (`hippo.core.acting.Acting`).
+
+    With `greedy` every level takes its most likely choice: mean action, likeliest option, termination where its
+    probability is above one half.
+    """
 
     def __init__(
-        self, policy: OptionPolicy, steps: Steps, generators: dict[str, torch.Generator], greedy: bool = False
+        self, policy: OptionPolicy, config: Any, num_envs: int, seed: int, iteration: int, greedy: bool = False
     ) -> None:
-        """Draws all randomness up front from the generators "skills", "manager" and "termination".
+        self.policy, self.horizon, self.greedy = policy, config.horizon, greedy
+        self._everywhere = np.arange(num_envs)
+        self.skill = np.zeros(num_envs, np.int64)  # (N,) the option in force
+        self.begins = np.ones(num_envs, bool)  # (N,) an episode begins with what is seen next
+        self._draw(seed, iteration)
+        self._renew_networks()
 
-        With `greedy` every level takes its most likely choice: mean action, likeliest option, termination where its
-        probability is above one half.
-        """
-        T, N, A = steps.action.shape
-        self.policy, self.steps, self.greedy = policy, steps, greedy
-        self._noise = torch.randn(T, N, A, generator=generators["skills"]).numpy() * (not greedy)
-        self._choice = torch.rand(T + 1, N, generator=generators["manager"]).numpy()
-        fire = torch.rand(T + 1, N, generator=generators["termination"])
-        self._fire = (torch.full_like(fire, 0.5) if greedy else fire).log().numpy()  # compared with log beta
+    def _draw(self, seed: int, iteration: int) -> None:
+        """The randomness of a horizon of T steps; T + 1 rows of what is decided before a step."""
+        self._seed, self._iteration, self._t = seed, iteration, 0
+        purposes = ("skills", "manager", "termination")
+        skills, manager, termination = (seeding.torch_generator(seed, purpose, iteration) for purpose in purposes)
+        T, N = self.horizon, len(self._everywhere)
+        shape = (T, N, self.policy.skills.log_std_parameter.shape[-1])
+        self._noise = torch.randn(shape, generator=skills).numpy() * (not self.greedy)
+        self._choice = torch.rand(T + 1, N, generator=manager).numpy()
+        fire = torch.rand(T + 1, N, generator=termination)
+        self._fire = (torch.full_like(fire, 0.5) if self.greedy else fire).log().numpy()  # compared with log beta
+
+    def _renew_networks(self) -> None:
+        policy = self.policy
+        self._view, self._act = policy.filter.actor(), policy.skills.actor()
+        self._logits, self._stop = policy.manager.actor(), for_few_rows(policy.termination)
+
+    def renew(self, obs: np.ndarray) -> None:
+        """Go on with the networks as they have become, and see `obs` (N, D) through their filter."""
+        self._renew_networks()
+        self._seen = self._view(obs)
+
+    def decide(self, obs: np.ndarray) -> np.ndarray:
+        """See `obs` (N, D), and go on with the option or choose one; returns where one was chosen, (N,) bool."""
+        self._seen = self._view(obs)
+        logit = self._stop(self._seen)[self._everywhere, self.skill]
+        decides = self.begins | (self._fire[self._t] < -np.logaddexp(0, -logit))
+        where = np.flatnonzero(decides)
+        if len(where):
+            logits = self._logits(self._seen[where])
+            chosen = logits.argmax(-1) if self.greedy else sample_categorical(logits, self._choice[self._t][where])
+            self.skill[where] = chosen
+        return decides
+
+    def action(self) -> np.ndarray:
+        """What the options in force do (N, A) about what was last seen."""
+        return self._act(self._seen[:, : self.policy.robot_size], self.skill, self._noise[self._t])
+
+    def act(self, obs: np.ndarray) -> np.ndarray:
+        """Decide and act."""
+        if self._t == self.horizon:
+            self._draw(self._seed, self._iteration + 1)
+        self.decide(obs)
+        return self.action()
+
+    def end(self, done: np.ndarray) -> None:
+        """One step has passed, and with it the episodes where `done` (N,)."""
+        self.begins = done
+        self._t += 1
+
+
+class Execution:
+    """One horizon of call-and-return, recorded in portions between which the policy may change.
+
+    It starts from fresh episodes; all randomness is named by (seed, iteration).
+    """
+
+    def __init__(
+        self, policy: OptionPolicy, config: Any, envs: Any, seed: int, iteration: int, greedy: bool = False
+    ) -> None:
+        T, N = config.horizon, envs.num_envs
+        self.steps = Steps(envs, T)
+        self.acting = Acting(policy, config, N, seed, iteration, greedy)
         shape = (T + 1, N)
         self.options = Options(
             torch.zeros(shape, dtype=torch.long),
@@ -97,40 +162,20 @@ class Execution:
         )
         # The same memory for numpy, whose small assignments cost a tenth of torch's.
         self._write = tuple(x.numpy() for x in (self.options.option, self.options.is_decision, self.options.begins))
+        self._obs = self.steps.reset(seeding.integer(seed, "episodes", iteration))
+        self._decide(0)
 
-    def start(self, seed: int) -> None:
-        """A fresh episode, and an option, in every environment."""
-        self._obs = self.steps.reset(seed)
-        self._everywhere = np.arange(len(self._obs))
-        self._option = np.zeros(len(self._obs), np.int64)
-        self._refresh()
-        self._arrive(0, np.ones(len(self._obs), bool))
-
-    def _refresh(self) -> None:
-        policy = self.policy
-        self._view, self._act = policy.filter.actor(), policy.skills.actor()
-        self._logits, self._stop = policy.manager.actor(), for_few_rows(policy.termination)
-
-    def _arrive(self, t: int, begins: np.ndarray) -> None:
-        """Go on with the option or choose one, in the state before step t."""
-        self._seen = self._view(self._obs)
-        logit = self._stop(self._seen)[self._everywhere, self._option]
-        decides = begins | (self._fire[t] < -np.logaddexp(0, -logit))
-        where = np.flatnonzero(decides)
-        if len(where):
-            logits = self._logits(self._seen[where])
-            chosen = logits.argmax(-1) if self.greedy else sample_categorical(logits, self._choice[t][where])
-            self._option[where] = chosen
-        option, is_decision, is_begin = self._write
-        option[t], is_decision[t], is_begin[t] = self._option, decides, begins
+    def _decide(self, t: int) -> None:
+        option, is_decision, begins = self._write
+        begins[t] = self.acting.begins
+        is_decision[t] = self.acting.decide(self._obs)
+        option[t] = self.acting.skill
 
     @torch.no_grad()
     def run(self, first: int, last: int) -> None:
         """Take the steps first .. last - 1 with the policy as it is now."""
-        self._refresh()
-        self._seen = self._view(self._obs)
-        robot = self.policy.robot_size
+        self.acting.renew(self._obs)
         for t in range(first, last):
-            action = self._act(self._seen[:, :robot], self._option, self._noise[t])
-            self._obs, done = self.steps.step(t, action)
-            self._arrive(t + 1, done)
+            self._obs, done = self.steps.step(t, self.acting.action())
+            self.acting.end(done)
+            self._decide(t + 1)

@@ -46,18 +46,23 @@ class EnvironmentFault(RuntimeError):
 
 @dataclass(frozen=True)
 class Layout:
-    """What an environment's observations and actions are, and how rows are made of them.
+    """What an environment's observations and actions are, and how rows of numbers become of them.
 
     A row holds the entries in `order` of the flattened observation: what skills see, then the rest.
     """
 
-    keys: tuple[str, ...]  # parts of a Dict observation as they are flattened; empty for a Box
-    names: tuple[str, ...]  # of the entries of a row
-    order: np.ndarray  # (D,) entries of the flattened observation
-    view: int  # how many of them skills see
-    middle: np.ndarray  # (A,) of the action's range
-    half: np.ndarray  # (A,) half of its width
-    dtype: np.dtype  # of actions
+    keys: Sequence[str]  # parts of a Dict observation as they are flattened; empty for a Box
+    flat: Sequence[str]  # names of the flattened observation's entries
+    order: Sequence[int]  # (D,) which of them each entry of a row is
+    view: int  # how many entries of a row skills see
+    middle: Sequence[float]  # (A,) of the action's range
+    half: Sequence[float]  # (A,) half of its width
+    dtype: str  # of actions
+
+    @property
+    def names(self) -> list[str]:
+        """(D,) of the entries of a row."""
+        return [self.flat[i] for i in self.order]
 
     def find(self, key: str, text: str) -> list[int]:
         """Where in a row the entries stand that `text`, the value of `key`, lists as `skill_view` does.
@@ -65,14 +70,17 @@ class Layout:
         Raises:
             Refused: it lists none, or some that do not exist.
         """
-        flat = [self.names[i] for i in np.argsort(self.order)]
-        return [self.names.index(flat[i]) for i in _entries(key, text or "nothing", flat)]
+        return [self.order.index(i) for i in _entries(key, text or "nothing", self.flat)]
 
     def rows(self, observation: Any, count: int) -> np.ndarray:
         """(count, D) float32 of a batch of observations."""
         parts = [observation[key] for key in self.keys] if self.keys else [observation]
         flat = np.concatenate([np.asarray(part).reshape(count, -1) for part in parts], 1)
         return flat[:, self.order].astype(np.float32)
+
+    def scaled(self, actions: np.ndarray) -> np.ndarray:
+        """Actions (N, A), clipped to [-1, 1], in the environment's range."""
+        return (np.array(self.middle) + np.array(self.half) * np.clip(actions, -1, 1)).astype(self.dtype)
 
 
 def is_foreign(name: str) -> bool:
@@ -167,19 +175,23 @@ def _layout(name: str, kwargs: str, skill_view: str) -> Layout:
         if json.loads(kwargs):
             raise Refused("kwargs", kwargs, f"{name} does not take them ({_line(error)})") from error
         raise Refused("env", name, f"cannot be made ({_line(error)})") from error
+    return layout_of_spaces(name, observation, action, skill_view)
+
+
+def layout_of_spaces(name: str, observation: gym.Space, action: gym.Space, skill_view: str = "") -> Layout:
+    """How rows are made of these spaces; Refused, under `name`, where it cannot be done."""
     parts = list(_parts(name, observation))
     flat = [f"{key}[{i}]" for key, size in parts for i in range(size)]
     seen = _entries("skill_view", skill_view, flat) or list(range(len(flat)))
-    order = np.array([*seen, *(i for i in range(len(flat)) if i not in set(seen))])
     low, high = _action_range(name, action)
     return Layout(
         tuple(key for key, _ in parts) if isinstance(observation, gym.spaces.Dict) else (),
-        tuple(flat[i] for i in order),
-        order,
+        tuple(flat),
+        (*seen, *(i for i in range(len(flat)) if i not in set(seen))),
         len(seen),
-        (high + low) / 2,
-        (high - low) / 2,
-        action.dtype,
+        tuple(((high + low) / 2).tolist()),
+        tuple(((high - low) / 2).tolist()),
+        str(action.dtype),
     )
 
 
@@ -233,47 +245,32 @@ class _Silent(gym.Wrapper):
 
 
 class GymnasiumEnv(gym.vector.VectorEnv):
-    """N environments of one id side by side; ends and time limits are told apart, and an end wins over a limit.
+    """Somebody's vector environment as the learners here want it; an end wins over a time limit.
 
     Args:
-        name: `gym:<id>`. seed: environment i starts from `seed + i`. horizon: the time limit in steps.
-        kwargs: arguments of the environment. skill_view: what skills see (`Layout`), "" for everything.
-        render_mode: Gymnasium's.
+        envs: begins a new episode in the step that ends one (SAME_STEP). layout: of its spaces. name: in messages.
+        seed: of the first reset if that is given none; environment i starts from `seed + i`. skill_view: `layout`'s.
 
     Raises:
-        Refused: what `find` and `check` refuse; its vector environment begins episodes in another way.
+        Refused: it begins episodes in another way.
     """
 
     def __init__(
-        self,
-        name: str,
-        num_envs: int,
-        seed: int,
-        horizon: int,
-        kwargs: dict[str, Any] | None = None,
-        skill_view: str = "",
-        render_mode: str | None = None,
+        self, envs: gym.vector.VectorEnv, layout: Layout, name: str, seed: int | None = None, skill_view: str = ""
     ) -> None:
-        kwargs = dict(kwargs or {})
-        self.layout = layout_of(name, {"kwargs": kwargs, "skill_view": skill_view})
-        self.robot_name, self.num_envs, self.horizon = name, num_envs, horizon
-        self.robot_size, self.observation_names = self.layout.view, list(self.layout.names)
-        self.observation_variant = skill_view
-        if render_mode is not None:
-            kwargs["render_mode"] = render_mode
-        self.envs = _vectorised(find(name), num_envs, kwargs | {"max_episode_steps": horizon})
-        mode = self.envs.metadata.get("autoreset_mode")
+        mode = envs.metadata.get("autoreset_mode")
         if mode is not AutoresetMode.SAME_STEP:
-            self.envs.close()
             raise Refused("env", name, f"its vector environment resets by {mode}; needed is {AutoresetMode.SAME_STEP}")
-        self.metadata = self.envs.metadata
-        bound = np.full(len(self.layout.order), np.inf, np.float32)
+        self.envs, self.layout, self.metadata, self.num_envs = envs, layout, envs.metadata, envs.num_envs
+        self.robot_name, self.observation_variant = name, skill_view
+        self.robot_size, self.observation_names = layout.view, layout.names
+        bound = np.full(len(layout.order), np.inf, np.float32)
         self.single_observation_space = gym.spaces.Box(-bound, bound, dtype=np.float32)
-        self.single_action_space = gym.spaces.Box(-1.0, 1.0, (len(self.layout.half),), np.float32)
-        self.observation_space = gym.vector.utils.batch_space(self.single_observation_space, num_envs)
-        self.action_space = gym.vector.utils.batch_space(self.single_action_space, num_envs)
-        self._first_seed: int | None = seed
-        self._clock = np.zeros(num_envs, np.int64)
+        self.single_action_space = gym.spaces.Box(-1.0, 1.0, (len(layout.half),), np.float32)
+        self.observation_space = gym.vector.utils.batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = gym.vector.utils.batch_space(self.single_action_space, self.num_envs)
+        self._first_seed = seed
+        self._clock = np.zeros(self.num_envs, np.int64)
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
         """Start new episodes, from `seed + i` if one is given.
@@ -295,8 +292,7 @@ class GymnasiumEnv(gym.vector.VectorEnv):
         Raises:
             EnvironmentFault: an observation or a reward is not finite.
         """
-        scaled = self.layout.middle + self.layout.half * np.clip(actions, -1, 1)
-        observation, reward, terminated, truncated, info = self.envs.step(scaled.astype(self.layout.dtype))
+        observation, reward, terminated, truncated, info = self.envs.step(self.layout.scaled(actions))
         self._clock += 1
         obs, reward = self.layout.rows(observation, self.num_envs), np.asarray(reward, np.float64)
         self._check("observation", np.isfinite(obs).all(1))
@@ -333,15 +329,38 @@ def _item(batch: Any, i: int) -> Any:
     return {key: part[i] for key, part in batch.items()} if isinstance(batch, dict) else batch[i]
 
 
-def _vectorised(spec: EnvSpec, num_envs: int, kwargs: dict[str, Any]) -> gym.vector.VectorEnv:
-    """The id's own vector environment where it begins episodes in the same step, else copies of the single one."""
+def make(
+    name: str,
+    num_envs: int,
+    seed: int,
+    horizon: int,
+    kwargs: dict[str, Any] | None = None,
+    skill_view: str = "",
+    render_mode: str | None = None,
+) -> GymnasiumEnv:
+    """N environments of `gym:<id>`: its own vector environment where that is SAME_STEP, else N of the single one.
+
+    Args:
+        horizon: the time limit in steps. kwargs: arguments of the environment. skill_view: what skills see, "" for
+        everything. render_mode: Gymnasium's.
+
+    Raises:
+        Refused: what `find` and `check` refuse.
+    """
+    layout = layout_of(name, {"kwargs": kwargs or {}, "skill_view": skill_view})
+    spec, arguments = find(name), (kwargs or {}) | {"max_episode_steps": horizon}
+    if render_mode is not None:
+        arguments["render_mode"] = render_mode
+    envs: gym.vector.VectorEnv | None = None
     if spec.vector_entry_point is not None:
-        own = gym.make_vec(spec, num_envs, **kwargs)
-        if own.metadata.get("autoreset_mode") is AutoresetMode.SAME_STEP or spec.entry_point is None:
-            return own
-        own.close()
+        envs = gym.make_vec(spec, num_envs, **arguments)
+        if envs.metadata.get("autoreset_mode") is not AutoresetMode.SAME_STEP and spec.entry_point is not None:
+            envs.close()
+            envs = None
 
-    def make() -> gym.Env:
-        return _Silent(gym.make(spec, disable_env_checker=True, **kwargs))
+    def single() -> gym.Env:
+        return _Silent(gym.make(spec, disable_env_checker=True, **arguments))
 
-    return SyncVectorEnv([make] * num_envs, autoreset_mode=AutoresetMode.SAME_STEP)
+    if envs is None:
+        envs = SyncVectorEnv([single] * num_envs, autoreset_mode=AutoresetMode.SAME_STEP)
+    return GymnasiumEnv(envs, layout, name, seed, skill_view)

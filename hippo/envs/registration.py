@@ -137,7 +137,7 @@ def make(
     if foreign.is_foreign(name):
         if autoreset_mode(autoreset) is not gym.vector.AutoresetMode.SAME_STEP:
             raise ValueError(f"autoreset={autoreset}: {name} has SameStep here; gymnasium.make_vec has the others")
-        return foreign.GymnasiumEnv(name, num_envs, seed, horizon, **options)
+        return foreign.make(name, num_envs, seed, horizon, **options)
     return RobotTaskEnv(
         ROBOTS[found.robot],
         found.task,
