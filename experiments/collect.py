@@ -93,13 +93,15 @@ def take(source: Path, runs_dir: Path) -> str:
 def copy(source: Path, target: Path) -> None:
     """Put a run's files into `target`, whose lock is held, status.json last: until then the run is not finished."""
     temporary = target / f"collected.{os.getpid()}.tmp"
-    shutil.copytree(source, temporary, ignore=shutil.ignore_patterns(*LEFT_BEHIND))
-    for path in sorted(temporary.iterdir(), key=lambda path: path.name == "status.json"):
-        there = target / path.name
-        if there.is_dir():
-            shutil.rmtree(there)
-        path.replace(there)
-    temporary.rmdir()
+    try:
+        shutil.copytree(source, temporary, ignore=shutil.ignore_patterns(*LEFT_BEHIND))
+        for path in sorted(temporary.iterdir(), key=lambda path: path.name == "status.json"):
+            there = target / path.name
+            if there.is_dir():
+                shutil.rmtree(there)
+            path.replace(there)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
 
 
 def trained_on(*folders: Path) -> str:

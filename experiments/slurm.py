@@ -230,6 +230,7 @@ def _submit_array(
         timeout_min=profile.time_minutes,
         mem_gb=profile.memory_gb,
         cpus_per_task=profile.cpus,
+        tasks_per_node=1,  # said, since of a whole node (--exclusive) srun would take every CPU for a task
         slurm_signal_delay_s=profile.signal_seconds,
         slurm_array_parallelism=profile.parallel,
         slurm_setup=[
