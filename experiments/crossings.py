@@ -1,4 +1,4 @@
-"""How walls are cleared on the Block tasks: how far from upright the torso is there, and how high."""
+"""How walls are cleared on the Block tasks, how far from upright the torso is there and how high; and walls unseen."""
 
 import math
 from collections.abc import Sequence
@@ -66,6 +66,45 @@ class Crossings:
             dict(zip(COLUMNS, (int(n), int(tumbled), float(height / n) if n else None), strict=True))
             for n, tumbled, height in zip(self._paid, self._tumbled, self._height, strict=True)
         ]
+
+
+class Walls:
+    """Block environments that note the mean of what is observed of walls, or show such a mean in its place.
+
+    The observation is the environment's own, before any normaliser of the policy; final observations, on which no
+    action depends, are left as they are.
+    """
+
+    def __init__(self, envs: Any, shown: np.ndarray | None = None) -> None:
+        names = [name for name, *_ in envs.task.entries]
+        self._envs, self._shown = envs, shown  # shown (8,): in the place of the entries of walls, None: as they are
+        self._columns = [envs.observation_names.index(name) for name in names]
+        self._sum, self._count = np.zeros(len(names)), 0
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._envs, name)
+
+    def reset(self, **arguments: Any) -> tuple[np.ndarray, dict[str, Any]]:
+        """As the environments' own."""
+        obs, info = self._envs.reset(**arguments)
+        return self._look(obs), info
+
+    def step(self, actions: np.ndarray) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """As the environments' own."""
+        obs, *others = self._envs.step(actions)
+        return self._look(obs), *others
+
+    def _look(self, obs: np.ndarray) -> np.ndarray:
+        self._sum += obs[:, self._columns].sum(0, dtype=float)
+        self._count += len(obs)
+        if self._shown is not None:
+            obs = obs.copy()
+            obs[:, self._columns] = self._shown
+        return obs
+
+    def mean(self) -> np.ndarray:
+        """(8,) of the entries of walls, over all environments and steps."""
+        return self._sum / self._count
 
 
 def totals(rows: Sequence[dict[str, Any]]) -> tuple[int, float, float]:

@@ -24,7 +24,7 @@ from scipy import stats
 from experiments import crossings
 from experiments.command_line import Parser, bad_input, check_writable, run_command
 from experiments.config import Run
-from experiments.crossings import Crossings, has_walls
+from experiments.crossings import Crossings, Walls, has_walls
 from experiments.manifest import changed_identity, stated
 from experiments.status import read_status, write_atomically
 from hippo.core import seeding
@@ -49,6 +49,7 @@ COLUMNS = (
     "length",
     "diverged",
 )
+BLANKED = "walls_blanked"  # column of such evaluations only
 
 
 def load_run(folder: Path) -> Run:
@@ -125,22 +126,30 @@ def changed_options(run: Run, changes: dict[str, Any]) -> dict[str, Any]:
     return run.options | {name: value for name, value in changes.items() if value is not None}
 
 
-def evaluate(run: Run, episodes: int, seed: int, greedy: bool = False, **changes: Any) -> list[dict[str, Any]]:
+def evaluate(
+    run: Run, episodes: int, seed: int, greedy: bool = False, blank_walls: bool = False, **changes: Any
+) -> list[dict[str, Any]]:
     """One row of COLUMNS, on Block tasks of crossings.COLUMNS too, per episode of the policy in `run`'s folder.
 
     Args:
         episodes: how many, all simulated side by side. seed: of the evaluation, apart from the run's.
+        blank_walls: what the policy observes of walls is replaced by its mean over the same evaluation with them.
         changes: options of the environment that differ from the run's, e.g. perturbation="mass".
 
     Raises:
-        ConfigError: there is nothing trained, or no such option.
+        ConfigError: there is nothing trained, no such option, or no wall to blank.
     """
     envs: Any = environments(run, episodes, seed, **changes)
-    options = changed_options(run, changes)
-    if has_walls(envs):
+    options, to_cross = changed_options(run, changes), has_walls(envs)
+    if blank_walls and not to_cross:
+        raise ConfigError("--blank-walls", run.env, "has no walls; the Block tasks have")
+    if to_cross:
         envs = Crossings(envs)
-    streams = seeding.integer(seed, "evaluation of a policy")
-    steps = rollout(learner_of(run.algo), run.restored_config, envs, streams, trained(run), greedy)
+    if blank_walls:
+        seen = Walls(environments(run, episodes, seed, **changes))
+        _roll_out(run, seen, seed, greedy)
+        envs = Walls(envs, seen.mean())
+    steps = _roll_out(run, envs, seed, greedy)
     returns, lengths = opening_episodes(steps.reward.numpy(), steps.done.numpy())
     common = {
         "run_id": name_of(run),
@@ -152,11 +161,19 @@ def evaluate(run: Run, episodes: int, seed: int, greedy: bool = False, **changes
         "seed": seed,
         "diverged": steps.diverged,
     }
-    walls = envs.rows() if isinstance(envs, Crossings) else [{}] * episodes
+    if blank_walls:
+        common[BLANKED] = True
+    walls = envs.rows() if to_cross else [{}] * episodes
     return [
         common | {"episode": i, "return": float(r), "length": int(n)} | crossed
         for i, (r, n, crossed) in enumerate(zip(returns, lengths, walls, strict=True))
     ]
+
+
+def _roll_out(run: Run, envs: Any, seed: int, greedy: bool) -> Any:
+    """The first episodes of the policy in `run`'s folder."""
+    streams = seeding.integer(seed, "evaluation of a policy")
+    return rollout(learner_of(run.algo), run.restored_config, envs, streams, trained(run), greedy)
 
 
 def evaluate_all(
@@ -173,7 +190,7 @@ def evaluate_all(
 def as_csv(rows: Sequence[dict[str, Any]]) -> str:
     """Rows of `evaluate` as csv text."""
     text = io.StringIO()
-    columns = COLUMNS + (crossings.COLUMNS if any("crossings" in row for row in rows) else ())
+    columns = [*COLUMNS, *(name for name in (*crossings.COLUMNS, BLANKED) if any(name in row for row in rows))]
     writer = csv.DictWriter(text, columns, lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
@@ -225,6 +242,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--episodes", type=int, default=25, help="the paper's 25 (Table 1)")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--greedy", action="store_true", help="most likely choices instead of samples")
+    parser.add_argument(
+        "--blank-walls", action="store_true", help="Block tasks: what is observed of walls is replaced by its mean"
+    )
     parser.add_argument("--csv", action="store_true", help="print a row per episode instead of the summary")
     parser.add_argument("--out", type=Path, help="csv to write, a row per episode")
     options = parser.parse_args(arguments)
@@ -234,14 +254,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
             check_writable("--out", options.out)
         run = load_run(options.run)
         changes = {"perturbation": options.perturbation, "strength": options.strength}
-        rows = evaluate(run, options.episodes, options.seed, options.greedy, **changes)
+        rows = evaluate(run, options.episodes, options.seed, options.greedy, options.blank_walls, **changes)
     except ConfigError as error:
         return bad_input(in_flags(error))
     except CheckpointError as error:
         return bad_input(error)
     if options.out is not None:
         write_atomically(options.out, as_csv(rows))
-    print(as_csv(rows).rstrip("\n") if options.csv else summary(rows))
+    blanked = "\nwith what is observed of walls replaced by its mean" if options.blank_walls else ""
+    print(as_csv(rows).rstrip("\n") if options.csv else summary(rows) + blanked)
     return 0
 
 

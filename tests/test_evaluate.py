@@ -51,10 +51,57 @@ def test_evaluation_repeats_itself_and_leaves_the_run_alone(algo, trained):
     assert {row["length"] for row in first} == {40}
 
 
-def test_on_block_tasks_a_row_says_how_walls_were_crossed_and_elsewhere_it_does_not(trained, tmp_path, capsys):
-    budget = ["iterations=1", "batch_size=400", "env.horizon=40", f"runs_dir={tmp_path}"]
-    run = compose_run(["env=block_half_cheetah", "algo=ppo", "scale=smoke", *budget])
+@pytest.fixture(scope="module")
+def block_run(tmp_path_factory):
+    """With a normaliser of observations."""
+    budget = ["iterations=1", "batch_size=400", "env.horizon=40", f"runs_dir={tmp_path_factory.mktemp('runs')}"]
+    run = compose_run(["env=block_half_cheetah", "algo=ppo", "scale=smoke", "protocol=modern", *budget])
     assert train.execute(run) == "finished"
+    return run
+
+
+def test_blanked_walls_are_replaced_by_their_mean_before_any_normaliser_and_nothing_else_is(block_run, monkeypatch):
+    looks = []
+
+    class Spy(crossings.Walls):
+        def _look(self, obs):
+            before = obs.copy()
+            shown = super()._look(obs)
+            looks.append((self._columns, before, shown))
+            return shown
+
+    monkeypatch.setattr(evaluate, "Walls", Spy)
+    plain = evaluate.evaluate(block_run, 4, seed=0)
+    assert not looks
+    rows = evaluate.evaluate(block_run, 4, seed=0, blank_walls=True)
+    half = len(looks) // 2  # the same evaluation with walls, then without
+    columns = looks[0][0]
+    names = [evaluate.environments(block_run, 1, 0).observation_names[c] for c in columns]
+    assert len(names) == 8
+    assert all("_wall_" in name for name in names)
+    mean = np.mean([before[:, columns] for _, before, _ in looks[:half]], (0, 1), dtype=float)
+    for i, (_, before, shown) in enumerate(looks):
+        if i < half:
+            np.testing.assert_array_equal(shown, before)
+        else:
+            np.testing.assert_allclose(shown[:, columns], np.broadcast_to(mean, (4, 8)), rtol=1e-5)
+            np.testing.assert_array_equal(np.delete(shown, columns, 1), np.delete(before, columns, 1))
+            assert shown.dtype == before.dtype
+    assert [row.pop("walls_blanked") for row in rows] == [True] * 4
+    assert rows[0].keys() == plain[0].keys()
+
+
+def test_blanking_walls_is_said_and_refused_where_there_are_none(block_run, trained, capsys):
+    assert evaluate.main([str(block_run.folder), "--episodes", "2", "--blank-walls"]) == 0
+    assert capsys.readouterr().out.endswith("walls replaced by its mean\n")
+    assert evaluate.main([str(block_run.folder), "--episodes", "2", "--blank-walls", "--csv"]) == 0
+    assert capsys.readouterr().out.splitlines()[0].endswith(",walls_blanked")
+    assert evaluate.main([str(trained["ppo"].folder), "--blank-walls"]) == 2
+    assert "--blank-walls=snake_gather: has no walls" in capsys.readouterr().err
+
+
+def test_on_block_tasks_a_row_says_how_walls_were_crossed_and_elsewhere_it_does_not(block_run, trained, capsys):
+    run = block_run
     capsys.readouterr()
     assert evaluate.main([str(run.folder), "--episodes", "3", "--csv"]) == 0
     rows = list(csv.DictReader(capsys.readouterr().out.splitlines()))
