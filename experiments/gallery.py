@@ -286,7 +286,7 @@ def film(path: Path, folder: Path, seed: int) -> None:
     for z in range(policy.num_skills):
         target, rng = folder / f"{metadata['env']}_skill_{z}.mp4", np.random.default_rng(seed)
         with streamed(target) as append:
-            envs = Recorded(make(metadata["env"], 1, seed, physics=PHYSICS), append)
+            envs = Recorded(make(metadata["env"], 1, seed, physics=PHYSICS), append, VIDEO_STEPS[metadata["env"]])
             obs, _ = envs.reset(seed=seed)
             for _ in range(VIDEO_STEPS[metadata["env"]]):
                 noise = rng.standard_normal((1, *envs.single_action_space.shape), np.float32)

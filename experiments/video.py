@@ -6,6 +6,7 @@ Needs EGL or OSMesa (`make install-render`).
 """
 
 import contextlib
+import os
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -15,6 +16,7 @@ from typing import Any
 import imageio.v2 as imageio
 import numpy as np
 import torch
+from gymnasium.error import DependencyNotInstalled
 
 from experiments.command_line import EXIT_FAILED, Parser, bad_input, clock, run_command
 from experiments.config import Run
@@ -23,8 +25,8 @@ from hippo.core import seeding
 from hippo.core.acting import rollout
 from hippo.core.checkpoint import CheckpointError
 from hippo.core.settings import ConfigError
-from hippo.envs.rendering import NoOpenGL, Renderer
-from hippo.envs.vector import RobotTaskEnv
+from hippo.envs import foreign
+from hippo.envs.rendering import NoOpenGL, Renderer, open_gl
 from hippo.learners import learner_of
 
 FRAMES_PER_SECOND = 25
@@ -33,8 +35,9 @@ FRAMES_PER_SECOND = 25
 class Recorded:
     """A vector environment of one that hands a frame to `write` every few steps, up to the end of the episode."""
 
-    def __init__(self, envs: RobotTaskEnv, write: Any) -> None:
-        self._envs, self._write, self._renderer = envs, write, Renderer(envs)
+    def __init__(self, envs: Any, write: Any, horizon: int) -> None:
+        self._envs, self._write, self._horizon = envs, write, horizon
+        self._renderer = envs if isinstance(envs, foreign.GymnasiumEnv) else Renderer(envs)
         self._every = max(1, round(envs.metadata["render_fps"] / FRAMES_PER_SECOND))
         self._steps, self._over = 0, False
         self._last_line = time.monotonic()
@@ -51,13 +54,14 @@ class Recorded:
         self._over = self._over or bool(result[2][0] or result[3][0])
         if time.monotonic() - self._last_line > 5:
             self._last_line = time.monotonic()
-            print(f"step {self._steps} of at most {self._envs.horizon}", flush=True)
+            print(f"step {self._steps} of at most {self._horizon}", flush=True)
         return result
 
     def close(self) -> None:
         """Release the graphics memory and the environment."""
         self._renderer.close()
-        self._envs.close()
+        if self._renderer is not self._envs:
+            self._envs.close()
 
 
 @contextlib.contextmanager
@@ -81,8 +85,13 @@ def record(run: Run, path: Path, seed: int, greedy: bool, **changes: Any) -> flo
         ConfigError: there is nothing trained, or no such option. NoOpenGL: nothing here can draw.
     """
     envs = environments(run, 1, seed, **changes)
+    if isinstance(envs, foreign.GymnasiumEnv):
+        os.environ.setdefault("MUJOCO_GL", open_gl())
+        envs.close()
+        how = run.options | {"render_mode": "rgb_array"}
+        envs = foreign.make(run.env, 1, seeding.integer(seed, "evaluation"), run.config.horizon, **how)
     with streamed(path) as write:
-        recorded = Recorded(envs, write)
+        recorded = Recorded(envs, write, run.config.horizon)
         streams = seeding.integer(seed, "evaluation of a policy")
         steps = rollout(learner_of(run.algo), run.restored_config, recorded, streams, trained(run), greedy)
     end = int(steps.done[:, 0].nonzero()[0]) + 1
@@ -114,7 +123,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return bad_input(in_flags(error))
     except CheckpointError as error:
         return bad_input(error)
-    except NoOpenGL as error:
+    except (NoOpenGL, DependencyNotInstalled) as error:
         print(f"error: {error}", file=sys.stderr)
         return EXIT_FAILED
     print(f"{path}: return {total:.2f}, drawn in {clock(time.monotonic() - start)}")

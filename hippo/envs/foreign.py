@@ -315,9 +315,9 @@ class GymnasiumEnv(gym.vector.VectorEnv):
             when = f"at step {self._clock[i]}"
             raise EnvironmentFault(f"{self.robot_name}: {what} of environment {i} is not finite {when}")
 
-    def frame(self) -> np.ndarray:
-        """A picture (H, W, 3) of the first environment, which must have been made to draw them."""
-        return np.asarray(self.envs.render()[0])  # type: ignore[index]
+    def frame(self, i: int) -> np.ndarray:
+        """A picture (H, W, 3) of environment `i`, which must have been made to draw them."""
+        return np.asarray(self.envs.render()[i])  # type: ignore[index]
 
     def close_extras(self, **_: Any) -> None:
         """Close the environments within."""
