@@ -54,6 +54,8 @@ class PPOConfig(SurrogateConfig):
         super().__post_init__()
         if self.action_repeat > self.horizon:
             raise ConfigError("action_repeat", self.action_repeat, f"must be at most the horizon, {self.horizon} steps")
+        if self.action_repeat == 1:
+            self.discount_per_step = False  # the same either way, so one run and not two
 
 
 class Acting:

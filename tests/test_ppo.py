@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 
+from experiments.config import compose_run
 from hippo.core import ppo
 from hippo.core.policies import GaussianPolicy
 
@@ -63,3 +64,11 @@ def test_one_update_is_the_plain_policy_gradient_step():
             torch.testing.assert_close(mine, reference - 0.1 * reference.grad, rtol=0, atol=1e-12)
     assert metrics["policy_approx_kl"] == pytest.approx(0.0, abs=1e-12)
     assert metrics["surrogate"] == pytest.approx(float(advantage.mean()), abs=1e-12)
+
+
+def test_one_discount_for_all_in_the_modern_protocol_and_no_setting_that_changes_nothing_in_an_identity():
+    flat = ["algo=ppo", "protocol=modern"]
+    assert compose_run([*flat, "algo.action_repeat=10"]).config.discount_per_step
+    assert not compose_run(["algo=ppo", "algo.action_repeat=10"]).config.discount_per_step  # as the authors' code
+    same = {compose_run([*flat, f"algo.discount_per_step={value}"]).run_id for value in ("true", "false")}
+    assert len(same) == 1
