@@ -107,7 +107,7 @@ coverage: install  ## the lines of each package, in per cent, that `make test` r
 		echo "$$package: $$($(PY) coverage report --include "$$package/*" --format=total) %"; done
 
 test-slow: install  ## the tests that take minutes
-	$(PY) pytest -m slow -s
+	$(PY) pytest -m slow -rP --numprocesses logical --maxprocesses 4 --dist load
 
 test-slurm: install  ## the launcher on a real one-node Slurm, installed by apt (as root) where it is missing
 	@$(PY) tests.slurm.cluster install || echo "no Slurm here and none to be installed: its tests are skipped" >&2
