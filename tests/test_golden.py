@@ -21,9 +21,10 @@ import numpy as np
 import pytest
 import torch
 
-from tests.test_training import LEARNERS, learner
+from tests.test_training import LEARNERS, MODERN_TOO, learner
 from tests.toy import progress, run
 
+EVERY = LEARNERS | MODERN_TOO
 GOLDEN = Path(__file__).parent / "golden" / "training"
 # The kernels of Nehalem and of Skylake-X differ by at most 1e-12 in these runs, one float32 on the way by 1e-7 or more.
 TOLERANCE = {"rtol": 1e-9, "atol": 1e-10}
@@ -51,7 +52,7 @@ def metrics(name: str, changed: str = "", factor: float = 1.0) -> dict[str, list
 
 
 def revision(name: str) -> int:
-    return sys.modules[LEARNERS[name][0].__module__].REVISION
+    return sys.modules[EVERY[name][0].__module__].REVISION
 
 
 def path_of(name: str) -> Path:
@@ -65,7 +66,7 @@ def learning_rates(name: str) -> list[str]:
     return ["learning_rate"] if getattr(config, "ppoc_faithful", False) else rates  # one Adam for all
 
 
-@pytest.mark.parametrize("name", LEARNERS)
+@pytest.mark.parametrize("name", EVERY)
 def test_a_learners_numbers_are_the_stored_ones_of_its_revision(name):
     stored = json.loads(path_of(name).read_text())
     assert stored["revision"] == revision(name), "the revision was bumped: write the golden files anew"
@@ -75,7 +76,7 @@ def test_a_learners_numbers_are_the_stored_ones_of_its_revision(name):
         np.testing.assert_allclose(column, stored["metrics"][key], **TOLERANCE, err_msg=f"{name}: {key}")
 
 
-@pytest.mark.parametrize(("name", "rate"), [(name, rate) for name in LEARNERS for rate in learning_rates(name)])
+@pytest.mark.parametrize(("name", "rate"), [(name, rate) for name in EVERY for rate in learning_rates(name)])
 def test_the_tolerance_still_sees_a_change_of_one_percent_in_the_learning_rate(name, rate):
     stored, now = json.loads(path_of(name).read_text())["metrics"], metrics(name, rate, 1.01)
     assert any(not np.allclose(column, stored[key], **TOLERANCE) for key, column in now.items())
@@ -97,7 +98,7 @@ def test_nothing_is_read_before_it_is_written(name, monkeypatch):
 
 if __name__ == "__main__":
     torch.set_num_threads(1)
-    for each in LEARNERS:
+    for each in EVERY:
         content = {"revision": revision(each), "metrics": metrics(each)}
         path_of(each).write_text(json.dumps(content, indent=1) + "\n")
         print(f"wrote {path_of(each)}")
