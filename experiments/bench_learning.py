@@ -18,6 +18,7 @@ import torch
 
 from experiments.bench_environments import registered
 from experiments.bench_measure import Row, contestants, one_core
+from experiments.calibration import CEILING
 from experiments.config import compose_run
 from experiments.train import prepare
 from hippo.core.checkpoint import Checkpoint
@@ -128,8 +129,13 @@ def line(what: str, seed: int, walls: Sequence[float], seconds: float, speed: fl
 
 
 def totals(name: str, table: Mapping[str, Sequence[float]]) -> Iterator[Row]:
-    """The mean over seeds of every learner's last mark, and how much of Stable-Baselines3's that is."""
+    """The mean over seeds of every learner's last mark, and how much that is of Stable-Baselines3's and of the ceiling.
+
+    The ceiling is the return of a blind gait (docs/environments/calibration.md); it can be passed.
+    """
     peer = float(np.mean(table["PPO, Stable-Baselines3"]))
     for what, walls in table.items():
         mean = float(np.mean(walls))
-        yield Row(name, f"{what}, mean of {len(walls)} seeds", mean, "walls", mean / peer if peer else None, "of SB3's")
+        of_all = f"{what}, mean of {len(walls)} seeds"
+        yield Row(name, of_all, mean, "walls", mean / peer if peer else None, "of SB3's")
+        yield Row(name, of_all, mean, "walls", mean / CEILING[name], "of the blind gait's")

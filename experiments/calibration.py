@@ -1,25 +1,33 @@
 """How much the Block tasks allow: random policies and the blind gaits of experiments/gaits.json, on fresh episodes.
 
-    python -m experiments.calibration        # the table of docs/environments/calibration.md, a few minutes
+    python -m experiments.calibration                   # the table of docs/environments/calibration.md, a few minutes
+    python -m experiments.calibration --figure fig3     # the finished runs of a figure, with walls and without
 
-Nothing here sees the robot or the walls, and nothing is trained.
+Nothing is trained here.
 """
 
+import argparse
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from experiments.command_line import Parser, bad_input, run_command
 from experiments.crossings import Crossings, totals
-from experiments.evaluate import interval
+from experiments.evaluate import evaluate, interval
 from experiments.gait_search import TASKS, actions, committed, row
+from experiments.plan import Entry, make_plan
 from hippo.core import seeding
+from hippo.core.checkpoint import CheckpointError
 from hippo.core.settings import ConfigError
 from hippo.envs import make
 from hippo.envs.blocks import TUMBLED
 
 Policy = Callable[[int], np.ndarray]  # step -> actions (N, A)
+CEILING = {"block_hopper": 7.60, "block_half_cheetah": 16.27}  # walls per episode of the blind gait, as the page says
+HEADER = f"| task | policy | walls per episode | 95 % interval | with \\|pitch\\| > {TUMBLED:g} rad | torso at, m |"
+BLANKED = " of the blind gait's | walls blanked | 95 % interval |"
 
 
 def uniform(envs: Any, rng: np.random.Generator) -> Policy:
@@ -59,11 +67,34 @@ def measure(
 
 def line(task: str, name: str, rows: Sequence[dict[str, Any]]) -> str:
     """One row of the table."""
-    walls = np.array([r["crossings"] for r in rows], float)
-    low, high = interval(walls)
     paid, tumbled, height = totals(rows)
     crossed = f"{tumbled:.0%} | {height:.2f}" if paid else "- | -"
-    return f"| `{task}` | {name} | {walls.mean():.2f} | {low:.2f} to {high:.2f} | {crossed} |"
+    return f"| `{task}` | {name} | {mean_and_interval(rows)} | {crossed} |"
+
+
+def mean_and_interval(rows: Sequence[dict[str, Any]]) -> str:
+    """Two cells: walls per episode and the interval of their mean."""
+    walls = np.array([r["crossings"] for r in rows], float)
+    low, high = interval(walls)
+    return f"{walls.mean():.2f} | {low:.2f} to {high:.2f}"
+
+
+def finished(figure: str, scale: str, protocol: str, runs_dir: Path) -> list[Entry]:
+    """The finished runs of a figure on the Block tasks; ConfigError where there are none."""
+    plan = make_plan(figure, scale, [], True, runs_dir, protocol)
+    found = [entry for entry in plan.entries if entry.run.env in TASKS and entry.state == "finished"]
+    if not found:
+        raise ConfigError("--figure", figure, f"has no finished run on a Block task at {plan.edition} in {runs_dir}")
+    return found
+
+
+def trained_line(entry: Entry, episodes: int, seed: int) -> str:
+    """One row about a trained policy: as the others, its share of the blind gait's walls, and with walls blanked."""
+    run = entry.run
+    rows, blanked = (evaluate(run, episodes, seed, blank_walls=blank) for blank in (False, True))
+    share = np.mean([r["crossings"] for r in rows]) / CEILING[run.env]
+    name = f"{entry.variant_label}, seed {run.seed}"
+    return f"{line(run.env, name, rows)} {share:.0%} | {mean_and_interval(blanked)} |"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -73,17 +104,36 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--episodes", type=int, default=100)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--tumble", action="store_true", help="with env.terminate_on_tumble=true")
+    parser.add_argument("--figure", help="instead: the policies of this figure's finished runs")
+    parser.add_argument("--scale", default="laptop")
+    parser.add_argument("--protocol", default="modern")
+    parser.add_argument("--runs-dir", type=Path, default=Path("runs"))
     options = parser.parse_args(arguments)
     for key, least in (("episodes", 1), ("seed", 0)):
         if getattr(options, key) < least:
             return bad_input(ConfigError(f"--{key}", getattr(options, key), f"must be at least {least}"))
-    print(f"| task | policy | walls per episode | 95 % interval | with \\|pitch\\| > {TUMBLED:g} rad | torso at, m |")
-    print("|---|---|---|---|---|---|")
+    if options.figure is not None:
+        return show_trained(options)
+    print(HEADER, "|---|---|---|---|---|---|", sep="\n")
     changes = {"terminate_on_tumble": True} if options.tumble else {}
     for task in [options.task] if options.task else TASKS:
         policies = {"uniform actions": uniform, "Gaussian noise": noise, "blind gait": blind_gait(task)}
         for name, policy in policies.items():
             print(line(task, name, measure(task, policy, options.episodes, options.seed, **changes)), flush=True)
+    return 0
+
+
+def show_trained(options: argparse.Namespace) -> int:
+    """`--figure`."""
+    try:
+        if options.tumble:
+            raise ConfigError("--tumble", True, "is of random policies and gaits, not of --figure")
+        entries = finished(options.figure, options.scale, options.protocol, options.runs_dir)
+        print(HEADER + BLANKED, "|---|---|---|---|---|---|---|---|---|", sep="\n")
+        for entry in (e for e in entries if options.task in (None, e.run.env)):
+            print(trained_line(entry, options.episodes, options.seed), flush=True)
+    except (ConfigError, CheckpointError) as error:
+        return bad_input(error)
     return 0
 
 

@@ -2,13 +2,16 @@
 
 import json
 import re
+from types import SimpleNamespace
 
 import mujoco
 import numpy as np
 import pytest
 
-from experiments import calibration, crossings, gait_search
+from experiments import calibration, crossings, gait_picture, gait_search
+from experiments.config import compose_run
 from experiments.crossings import Crossings
+from experiments.plan import Entry
 from hippo.envs import make
 
 CALIBRATION = gait_search.FOUND.parent.parent / "docs/environments/calibration.md"
@@ -85,6 +88,57 @@ def test_the_committed_gait_clears_walls_without_seeing_them_as_the_page_says(ta
     assert np.mean([row["crossings"] for row in rows]) > float(written[1]) / 2
 
 
+def test_a_strip_shows_the_gait_around_the_clearing_of_a_wall(monkeypatch):
+    class Recorder:
+        def __init__(self, envs, width, height):
+            self.envs, self.blank = envs, np.zeros((height, width, 3), np.uint8)
+
+        def frame(self, i):
+            seen.append((self.envs.physics.data(i).time, int(self.envs.task.cleared[i])))
+            return self.blank
+
+        def close(self):
+            pass
+
+    seen = []
+    monkeypatch.setattr(gait_picture, "Renderer", Recorder)
+    assert gait_picture.frames_of("block_half_cheetah").shape == (240, 6 * 320, 3)
+    assert [cleared for _, cleared in seen] == [1, 1, 1, 2, 2, 2]
+    np.testing.assert_allclose(np.diff([time for time, _ in seen]), gait_picture.APART, atol=0.051)
+
+
+@pytest.mark.parametrize("task", gait_search.TASKS)
+def test_the_ceiling_is_what_the_page_says_of_the_blind_gait(task):
+    written = re.search(rf"\| `{task}` \| blind gait \| ([0-9.]+) ", CALIBRATION.read_text())
+    assert calibration.CEILING[task] == float(written[1])
+
+
+def test_a_figure_s_finished_runs_have_a_row_each_with_walls_and_without(tmp_path, monkeypatch, capsys):
+    def entry(env, state):
+        return Entry(compose_run([f"env={env}", "algo=ppo", "scale=smoke"], tmp_path), env, "ppo", "PPO", state)
+
+    made = [entry("snake_gather", "finished"), entry("block_hopper", "running")]  # no walls; not finished
+    plan = SimpleNamespace(entries=made, edition="scale smoke")
+    monkeypatch.setattr(calibration, "make_plan", lambda *arguments: plan)
+    arguments = ["--figure", "fig3", "--scale", "smoke", "--runs-dir", str(tmp_path)]
+    assert calibration.main(arguments) == 2
+    error = f"error: --figure=fig3: has no finished run on a Block task at scale smoke in {tmp_path}\n"
+    assert capsys.readouterr().err == error
+    made.append(entry("block_half_cheetah", "finished"))
+    walls = {False: (10, 6), True: (4, 4)}
+
+    def evaluate(run, episodes, seed, blank_walls):
+        return [dict(zip(crossings.COLUMNS, (n, n // 2, 0.5), strict=True)) for n in walls[blank_walls]]
+
+    monkeypatch.setattr(calibration, "evaluate", evaluate)
+    assert calibration.main(arguments) == 0
+    header, rule, row = capsys.readouterr().out.splitlines()
+    assert header.replace("\\|", "").count("|") == rule.count("|") == row.count("|")
+    cells = row.split(" | ")
+    assert cells[1:3] == ["PPO, seed 0", "8.00"]
+    assert cells[4:8] == ["50%", "0.50", "49%", "4.00"]
+
+
 def test_the_command_prints_a_row_per_task_and_policy(monkeypatch, capsys):
     monkeypatch.setattr(calibration, "make", lambda *a, **k: make(*a, **k | {"horizon": 3}))
     assert calibration.main(["--episodes", "2", "--tumble"]) == 0
@@ -99,6 +153,10 @@ def test_the_command_prints_a_row_per_task_and_policy(monkeypatch, capsys):
         (gait_search.main, ["block_hopper", "--seed", "-1"], "--seed=-1"),
         (calibration.main, ["--episodes", "0"], "--episodes=0: must be at least 1"),
         (calibration.main, ["--seed", "-1"], "--seed=-1"),
+        (gait_picture.main, ["gaits.jpg"], "out=gaits.jpg: must end in .png"),
+        (gait_picture.main, ["nowhere/gaits.png"], "out=nowhere/gaits.png: must be a file that can be written"),
+        (calibration.main, ["--figure", "fig33"], "figure=fig33: "),
+        (calibration.main, ["--figure", "fig3", "--tumble"], "--tumble"),
     ],
 )
 def test_bad_input_is_refused_in_a_line(main, arguments, message, capsys):
