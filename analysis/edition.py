@@ -15,7 +15,7 @@ from typing import Any
 PAPER = "paper"  # the protocol whose folders carry no name
 OVERRIDDEN = "overridden"  # folder of what has overrides
 FIGURE = re.compile(r"\w+")
-NEVER_OVERRIDES = ("wandb.",)  # settings that change no number
+NEVER_OVERRIDES = ("wandb.", "log.")  # settings that change no number
 
 
 @dataclass(frozen=True)

@@ -122,6 +122,13 @@ class WandbConfig:
 
 
 @dataclass
+class LogConfig:
+    """What a run leaves besides its own files."""
+
+    tensorboard: bool = setting(False, "whether it is mirrored to <run>/tensorboard, for TensorBoard (docs/wandb.md)")
+
+
+@dataclass
 class RunSchema:
     """The root of a composed configuration."""
 
@@ -137,6 +144,7 @@ class RunSchema:
     off_policy: OffPolicyBudget = field(default_factory=OffPolicyBudget)
     protocol: Protocol = field(default_factory=Protocol)
     wandb: WandbConfig = field(default_factory=WandbConfig)
+    log: LogConfig = field(default_factory=LogConfig)
 
 
 @dataclass(frozen=True)
@@ -156,6 +164,7 @@ class Run:
     kind: str = "train"  # or pretrain; evaluate and measure are about the trained run with the same settings
     evaluation: dict[str, Any] | None = None  # of kind evaluate: episodes, perturbations, strengths
     protocol: str = "paper"
+    tensorboard: bool = False
     place: Path | None = None  # its folder, if it was read from one that need not be named after it
 
     @functools.cached_property
@@ -543,5 +552,6 @@ def _validated(config: DictConfig, algo: str, names: dict[str, str]) -> Run:
         plain["wandb"]["project"],
         env["seconds_per_step"],
         kind="pretrain" if algo in PRETRAINING.values() else "train",
+        tensorboard=plain["log"]["tensorboard"],
         protocol=plain["protocol"]["name"] if algo in plain["protocol"]["learners"] else Run.protocol,
     )

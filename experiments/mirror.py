@@ -1,8 +1,9 @@
-"""Mirror finished runs to Weights & Biases, for instance those that were trained with wandb.mode=disabled.
+"""Mirror finished runs to Weights & Biases or TensorBoard, for instance those that were trained without.
 
     python -m experiments.mirror runs/<run_id> ... [--mode offline] [--project hippo]
+    python -m experiments.mirror runs/<run_id> ... --to tensorboard
 
-What wandb gets is what it would have got during training: docs/wandb.md.
+What they get is what they would have got during training: docs/wandb.md.
 """
 
 import sys
@@ -12,7 +13,7 @@ from pathlib import Path
 from experiments.command_line import EXIT_FAILED, Parser, bad_input, run_command
 from experiments.config import WANDB_MODES, WandbConfig
 from experiments.evaluate import load_finished_run
-from hippo.core.mirror import LOG, start_mirror
+from hippo.core.mirror import log_of, start_mirror
 from hippo.core.settings import ConfigError
 
 
@@ -20,6 +21,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Mirror from the command line; nothing is sent unless all of `runs` are finished."""
     parser = Parser(prog="experiments.mirror", description=__doc__.splitlines()[0])
     parser.add_argument("runs", type=Path, nargs="+", help="run folders")
+    parser.add_argument("--to", choices=("wandb", "tensorboard"), default="wandb")
     parser.add_argument("--mode", choices=WANDB_MODES[1:], default="online", help="offline: `wandb sync` uploads later")
     parser.add_argument("--project", default=WandbConfig.project)
     options = parser.parse_args(arguments)
@@ -28,11 +30,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
             load_finished_run(folder)
     except ConfigError as error:
         return bad_input(error)
-    codes = []
+    codes, how = [], (options.mode, options.project) if options.to == "wandb" else ()
     for folder in options.runs:
-        codes.append(start_mirror(folder, options.mode, options.project).wait())
+        codes.append(start_mirror(folder, options.to, *how).wait())
         if codes[-1]:
-            print(f"error: {folder} is not mirrored (log: {folder / LOG})", file=sys.stderr)
+            print(f"error: {folder} is not mirrored (log: {log_of(folder, options.to)})", file=sys.stderr)
         else:
             print(f"mirrored {folder}", flush=True)
     return EXIT_FAILED if any(codes) else 0

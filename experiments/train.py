@@ -120,7 +120,8 @@ def _execute_locked(run: Run) -> str:
     status = Status(run)
     status.update()
     try:
-        with _preemption(status), status.heartbeat(), mirrored(run.folder, run.wandb_mode, run.wandb_project):
+        mirrors = mirrored(run.folder, (run.wandb_mode, run.wandb_project), run.tensorboard)
+        with _preemption(status), status.heartbeat(), mirrors:
             _work(run, status)
     except Preempted:  # between the lines of `_work`, or while it ended
         _stopped(status)

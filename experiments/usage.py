@@ -8,6 +8,7 @@ from typing import Any
 from experiments.config import (
     BUDGET_FIELDS,
     GROUPS,
+    LogConfig,
     Run,
     RunSchema,
     WandbConfig,
@@ -26,6 +27,7 @@ def text(run: Run) -> str:
     groups = [_line(group, getattr(run, group), "", group_choices(group)) for group in GROUPS]
     root = [_of(f, getattr(run, f.name)) for f in dataclasses.fields(RunSchema) if f.metadata]
     mirror = [_of(f, getattr(run, f"wandb_{f.name}"), "wandb.") for f in dataclasses.fields(WandbConfig)]
+    mirror += [_of(f, getattr(run, f.name), "log.") for f in dataclasses.fields(LogConfig)]
     config = {f.name: _of(f, getattr(run.config, f.name), level_of(f.name)) for f in dataclasses.fields(run.config)}
     budget = [config.pop(name) for name in BUDGET_FIELDS]
     values, valid = {f.name: default_of(f) for f in option_fields()} | run.options, environment(run.env).options

@@ -36,7 +36,7 @@ def test_a_name_depends_on_what_is_overridden_and_on_nothing_else():
     )
     assert Edition.of("smoke", settings=["algo.clip_range=0.3", *OVERRIDE]) == other  # the last counts, as in a run
     assert Edition.of("smoke", settings=["algo.clip_range=0.3"]).name("fig3") != other.name("fig3")
-    assert Edition.of("smoke", settings=["wandb.mode=offline"]) == plain  # changes no number
+    assert Edition.of("smoke", settings=["wandb.mode=offline", "log.tensorboard=true"]) == plain  # change no number
 
 
 def test_a_plan_with_overrides_lies_beside_the_unmodified_one_and_says_what_they_are(one_method, tmp_path):

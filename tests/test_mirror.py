@@ -1,4 +1,6 @@
-"""The mirror to Weights & Biases: exactly progress.csv, through kills; it may hang or fail; it never sees the key."""
+"""The mirrors to Weights & Biases and TensorBoard: exactly progress.csv, through kills; they may hang or fail; neither
+sees a key.
+"""
 
 import csv
 import json
@@ -9,8 +11,10 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import psutil
 import pytest
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from experiments import mirror as mirror_command
 from experiments import train
@@ -161,3 +165,79 @@ def test_a_row_counts_as_covered_once_a_later_one_or_the_end_is_seen(tmp_path):
         (tmp_path / "status.json").write_text(f'{{"state": "{state}"}}')
         rows, over = mirror.covered_rows(tmp_path)
         assert (len(rows), over) == (covered, ended)
+
+
+# --------------------------------------------------------------------------------------------------------- TensorBoard
+
+
+def scalars(folder):
+    """env_steps -> columns of what TensorBoard shows of a run."""
+    shown = EventAccumulator(str(folder / "tensorboard")).Reload()
+    table = {}
+    for name in shown.Tags()["scalars"]:
+        for event in shown.Scalars(name):
+            assert name not in table.setdefault(event.step, {}), "twice"
+            table[event.step][name] = event.value
+    return table
+
+
+def in_single_precision(folder):
+    """What it is to show: event files hold single precision."""
+    rows = progress(folder).values()
+    with np.errstate(over="ignore"):
+        return {int(row["env_steps"]): {name: float(np.float32(value)) for name, value in row.items()} for row in rows}
+
+
+def test_after_a_kill_tensorboard_shows_exactly_the_rows_of_progress_csv_once(tmp_path):
+    arguments = ["env=block_hopper", "scale=smoke", "iterations=60", "batch_size=400", f"runs_dir={tmp_path}"]
+    command = [sys.executable, "-m", "experiments.train", *arguments, "log.tensorboard=true"]
+    run = compose_run(arguments)
+    process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    while read_status(run.folder)["iteration"] < 15:
+        assert process.poll() is None
+        time.sleep(0.05)
+    (child,) = [p for p in psutil.Process(process.pid).children() if "hippo.core.mirror" in p.cmdline()]
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    child.wait(20)  # ends by itself
+    assert scalars(run.folder).items() <= in_single_precision(run.folder).items()
+    assert subprocess.run(command, cwd=ROOT, capture_output=True, check=False).returncode == 0
+    assert read_status(run.folder)["state"] == "finished"
+    assert scalars(run.folder) == in_single_precision(run.folder)
+    assert len(scalars(run.folder)) == 60
+    assert len(list((run.folder / "tensorboard").glob("events.*"))) == 1
+
+
+def test_a_tensorboard_that_is_missing_never_stops_or_changes_training(tmp_path, monkeypatch, capsys):
+    alone = compose_run([*TINY, f"runs_dir={tmp_path / 'alone'}"])
+    assert train.execute(alone) == "finished"
+    (tmp_path / "fake").mkdir()
+    (tmp_path / "fake/tensorboard.py").write_text("raise ModuleNotFoundError('none')")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path / "fake"))
+    run = compose_run([*TINY, f"runs_dir={tmp_path / 'runs'}", "log.tensorboard=true"])
+    assert train.execute(run) == "finished"
+    error = capsys.readouterr().err
+    assert "warning: the tensorboard mirror ended with exit code 1; progress.csv is complete" in error
+    assert error.count("\n") == 1
+    for name in ("progress.csv", "checkpoint.pt"):
+        assert (run.folder / name).read_bytes() == (alone.folder / name).read_bytes()
+
+
+def test_a_finished_run_is_shown_to_tensorboard_afterwards(tmp_path, capsys):
+    run = compose_run([*TINY, f"runs_dir={tmp_path}"])
+    assert train.execute(run) == "finished"
+    assert not (run.folder / "tensorboard").exists()
+    for _ in range(2):
+        assert mirror_command.main([str(run.folder), "--to", "tensorboard"]) == 0
+        assert scalars(run.folder) == in_single_precision(run.folder)
+
+
+def test_whether_it_is_shown_decides_no_number_and_is_yes_or_no(capsys):
+    assert compose_run([*TINY, "log.tensorboard=true"]).run_id == compose_run(TINY).run_id
+    assert train.main([*TINY, "log.tensorboard=perhaps"]) == 2
+    error = capsys.readouterr().err
+    assert "log.tensorboard=perhaps" in error
+    assert error.count("\n") == 1
+    older = compose_run(TINY).to_yaml().replace("tensorboard: false\n", "")
+    assert "tensorboard" not in older
+    assert not type(compose_run(TINY)).from_yaml(older, Path("runs")).tensorboard
