@@ -188,7 +188,9 @@ def test_help_lists_every_key_with_a_value_that_may_be_typed_and_its_meaning(alg
     run = compose_run(chosen)
     settings = {f"algo.{f.name}" for f in dataclasses.fields(run.config)} - {f"algo.{name}" for name in BUDGET_FIELDS}
     options = {f"env.{name}" for name in ENVIRONMENTS[run.env].options}
-    others = {"env.horizon", "iterations", "batch_size", "seed", "runs_dir", "wandb.mode", "wandb.project"}
+    others = {"env.horizon", "iterations", "batch_size", "seed", "runs_dir", "wandb.mode", "wandb.project"} | {
+        "log.tensorboard"
+    }
     assert {key for key, *_ in said} == settings | options | others | GROUPS.keys()
     assert compose_run([f"{key}={value}" for key, value, _ in said]) == run  # the values are those of the run
 
