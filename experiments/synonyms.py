@@ -37,6 +37,7 @@ WORDS = {
     "algo.action_repeat": "frame_skip frameskip",
     "algo.replay_size": "buffer_size replay_buffer_size",
     "algo.warmup_steps": "learning_starts start_steps",
+    "algo.target_kl": "kl_target max_kl kl_threshold",
     "algo.tau": "polyak",
     "env.horizon": "max_path_length max_episode_steps episode_length max_ep_len time_limit",
     "seed": "random_seed rng_seed",

@@ -265,3 +265,15 @@ def test_training_environments_are_independent_of_their_number(tmp_path):
     few, many = prepare(run)(2, "training"), prepare(run)(4, "training")
     np.testing.assert_array_equal(few.reset(seed=9)[0], many.reset(seed=9)[0][:2])
     assert torch.get_num_threads() == 1
+
+
+def test_a_maze_of_gymnasium_robotics_is_found_by_its_id_and_trains(tmp_path):
+    pytest.importorskip("gymnasium_robotics")
+    maze = ["env=gym:AntMaze_UMaze-v5", "env.skill_view=observation", "env.horizon=20", "batch_size=40"]
+    run = compose_run([*maze, "scale=smoke", "iterations=1", f"runs_dir={tmp_path}"])
+    assert run.identity["package"].startswith("gymnasium-robotics ")
+    assert execute(run) == "finished"
+    envs = prepare(run)(1, "training")
+    assert envs.observation_names[envs.robot_size :] == [
+        f"{goal}_goal[{i}]" for goal in ("achieved", "desired") for i in (0, 1)
+    ]

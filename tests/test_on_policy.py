@@ -235,6 +235,18 @@ def test_minibatch_steps_equal_torchs_own_autograd_and_adam_in_float64():
         assert any(not torch.allclose(a, b, rtol=1e-4) for a, b in zip(ours, plain(**wrong), strict=True))
 
 
+def test_passes_stop_where_the_policy_has_gone_far_enough(tmp_path):
+    def trained(name, **settings):
+        run(hippo.train, hippo_config(**settings), tmp_path / name)
+        return (tmp_path / name / "progress.csv").read_bytes()
+
+    one, all_five = trained("one", updates=1), trained("all five", updates=5)
+    assert trained("stopped", updates=5, target_kl=1e-12) == one  # every pass goes further than that
+    assert trained("never", updates=5, target_kl=1e9) == all_five != one
+    with pytest.raises(ConfigError, match=r"target_kl=0\.1: needs minibatches"):
+        hippo_config(target_kl=0.1, minibatch_size=0, value_loss_weight=0.0, max_gradient_norm=0.0)
+
+
 def test_a_minibatch_holds_the_steps_of_the_skills_and_the_decisions_made_in_them():
     config = hippo_config()
     policy = HierarchicalPolicy(config, 2, 2, 2, torch.Generator().manual_seed(0))

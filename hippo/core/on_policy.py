@@ -105,12 +105,18 @@ class SurrogateConfig(OnPolicyConfig):
     max_gradient_norm: float = setting(
         0.0, "clip the gradient of a minibatch to this norm; 0: do not", code="0", low=0.0
     )
+    target_kl: float = setting(
+        0.0,
+        "no further pass over the batch once a level's mean KL divergence in a pass is above this; 0: all passes",
+        code="0",
+        low=0.0,
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.minibatch_size > self.batch_size:
             raise ConfigError("minibatch_size", self.minibatch_size, f"must be at most the batch, {self.batch_size}")
-        for key in ("value_loss_weight", "entropy_weight", "max_gradient_norm"):
+        for key in ("value_loss_weight", "entropy_weight", "max_gradient_norm", "target_kl"):
             if getattr(self, key) and not self.minibatch_size:
                 raise ConfigError(key, getattr(self, key), "needs minibatches: set minibatch_size")
 
@@ -162,7 +168,7 @@ def _in_minibatches(
     """`improve` in minibatches: sets of steps that levels and critics share, each learning from the mean over its rows.
 
     A level whose rows are fewer (`Level.at`) takes part with those that lie in the minibatch. The metrics are means
-    over the last pass.
+    over the last pass that was taken.
     """
     parts = max(1, num_steps // config.minibatch_size)
     parameters = [p for group in optimizer.param_groups for p in group["params"]]
@@ -171,23 +177,23 @@ def _in_minibatches(
     old = [in_chunks(level.log_prob, len(level.advantage)).numpy() for level in levels]
     advantage = [level.advantage.numpy() for level in levels]
     at = [None if level.at is None else level.at.numpy() for level in levels]
-    sums = np.zeros((len(levels), 3))  # of the last pass: KL, clipped, surrogate
+    sums, sizes = np.zeros((len(levels), 3)), np.array([len(a) for a in advantage])
     for step, minibatch in enumerate(minibatches(num_steps, parts, passes, generator)):
+        if step % parts == 0:
+            if config.target_kl and (sums[:, 0] > config.target_kl * sizes).any():
+                break
+            sums[:] = 0  # of this pass: KL, clipped, surrogate
         rows = minibatch.numpy()
         for i, share in enumerate(shares):
             own = rows if at[i] is None else at[i][rows]  # type: ignore[index]
             own = own[own >= 0]
-            terms = share.ascend(own, old[i][own], advantage[i][own], config.clip_range, config.entropy_weight)
-            if step >= parts * (passes - 1):
-                sums[i] += terms
+            sums[i] += share.ascend(own, old[i][own], advantage[i][own], config.clip_range, config.entropy_weight)
         for critic in critics:
             critic.descend(rows, config.value_loss_weight)
         if config.max_gradient_norm:
             nn.utils.clip_grad_norm_(parameters, config.max_gradient_norm)
         optimizer.step()
     metrics: dict[str, float] = {}
-    for level, (kl, clipped, _) in zip(levels, sums, strict=True):
-        size = len(level.advantage)
+    for level, (kl, clipped, _), size in zip(levels, sums, sizes, strict=True):
         metrics |= {f"{level.name}_approx_kl": kl / size, f"{level.name}_clip_fraction": clipped / size}
-    surrogate = sum(total / len(level.advantage) for level, total in zip(levels, sums[:, 2], strict=True))
-    return metrics | {"surrogate": float(surrogate)}
+    return metrics | {"surrogate": float((sums[:, 2] / sizes).sum())}
