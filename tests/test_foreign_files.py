@@ -388,6 +388,7 @@ def test_a_stopped_trainer_that_holds_its_lock_is_waited_for_quietly(tmp_path, m
 
     assert sweep.train_all([run], 1, report) == {run.run_id: "finished"}
     assert len(launches) == 2
+    assert len(looks) >= 5  # not launched again before
 
 
 def test_a_soft_lock_whose_owner_has_been_silent_for_long_is_taken_over(tmp_path, monkeypatch, capsys):
