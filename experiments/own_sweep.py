@@ -153,7 +153,17 @@ def stored(name: str, runs_dir: Path) -> Sweep | None:
     path = place(name, runs_dir)
     try:
         found = read_json(path, STORED)
-        if set(found) != set(STORED) or found["name"] != name:
+        if (
+            set(found) != set(STORED)
+            or found["name"] != name
+            or not all(
+                isinstance(of, list) and of and all(isinstance(x, str) for x in of) for of in found["over"].values()
+            )
+            or not all(isinstance(value, str) for value in found["set"].values())
+            or found["scale"] not in choices("scale")
+            or found["protocol"] not in choices("protocol")
+            or not 1 <= found["seeds"] <= MOST
+        ):
             raise DamagedFile(f"{path}: is no sweep called {name}")
         return Sweep(**found)
     except (FileNotFoundError, NotADirectoryError):
@@ -185,6 +195,8 @@ def chosen(options: argparse.Namespace) -> Sweep | None:
     Raises:
         ConfigError: a value that cannot be, or another sweep of that name.
     """
+    if options.figure is not None and options.name is not None:
+        raise ConfigError("name", options.name, f"and {options.figure}: give one")
     if all(getattr(options, key) is None for key in ("over", "seeds", "file")) and (options.figure or options.name):
         name = options.figure or options.name
         sweep = None if name in (*choices("figure"), "all") else stored(name, options.runs_dir)

@@ -97,6 +97,8 @@ WRONG = [
     (["--over", "algo.gamma=0.1"], "name=: "),
     ([], "name=: name a figure (fig3), or a sweep of your own"),
     (["fig3", "--over", "algo.gamma=0.1"], "figure=fig3: has a name already"),
+    (["fig3", "--name", "a"], "name=a: and fig3: give one"),
+    (["--name", "a", "--over", "env=gym:Hoper-v5"], "Hopper-v5"),
     (["fig3", "fig4"], "takes one figure or sweep at a time"),
     (["--file", "nowhere.yaml"], "must be a yaml file"),
     (["--name", "a", "--over", "algo.gamma=range(0,1,0.0001)"], "20,000 runs: more than 1,000"),
@@ -225,15 +227,22 @@ def test_nothing_is_stored_by_looking(tmp_path, begun, monkeypatch):
 
 def test_a_damaged_description_is_one_line(tmp_path, capsys):
     (tmp_path / "runs/sweeps").mkdir(parents=True)
-    for content in (
-        "{",
-        '{"name": "lr"}',
-        '{"name": "x", "over": {}, "set": {}, "seeds": 1, "scale": "s", "protocol": "p"}',
-    ):
+    good = {"name": "lr", "over": {"algo": ["ppo"]}, "set": {}, "seeds": 1, "scale": "smoke", "protocol": "paper"}
+    changes = (
+        {"name": "x"},
+        {"over": {"algo": 1}},
+        {"over": {"algo": [1]}},
+        {"set": {"a": 1}},
+        {"seeds": 0},
+        {"scale": "../x"},
+    )
+    for content in ("{", '{"name": "lr"}', *(json.dumps(good | change) for change in (*changes, {"more": 1}))):
         (tmp_path / "runs/sweeps/lr.json").write_text(content)
-        assert run(tmp_path, "lr", action="status") == 2
+        assert run(tmp_path, "lr", action="status") == 2, content
         assert capsys.readouterr().err.count("\n") == 1
     assert stored("../x", tmp_path) is None
+    (tmp_path / "runs/sweeps/lr.json").write_text(json.dumps(good))
+    assert run(tmp_path, "lr", action="status") == 0
 
 
 def test_what_costs_hours_is_asked_for_with_commands_that_there_are(tmp_path, begun, capsys):
