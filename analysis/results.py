@@ -21,6 +21,7 @@ from analysis.verdicts import NOT_REPRODUCED, REPRODUCED, Ruling
 
 ROOT = Path(__file__).parent.parent
 DATA = ROOT / "paper_figures" / "data"
+CALIBRATION = ROOT / "docs" / "environments" / "calibration.md"
 SCALES = ("laptop", "paper")  # the larger one last
 HEAD = """# Results
 
@@ -166,6 +167,13 @@ def differences(rulings: Rulings) -> list[str]:
     return [*lines, ""]
 
 
+def ends_of_the_scale() -> list[str]:
+    """What random policies, a blind gait and trained policies clear on the Block tasks: the first tables of its page."""
+    tables = re.findall(r"(?:^\|.*\n)+", CALIBRATION.read_text(), re.MULTILINE)[:2]
+    where = "From [environments/calibration.md](environments/calibration.md), which says how it is measured."
+    return ["## How much the Block tasks allow", "", where, "", *tables]
+
+
 def load_all(runs_dir: Path, data: Path) -> Everything:
     """All committed rows, from plans in `runs_dir` (for names only) and rows in `data`."""
     everything: Everything = {}
@@ -191,6 +199,7 @@ def pages(everything: Everything, pictures: Path) -> tuple[str, str]:
     for of_edition in everything.values():
         for results in of_edition.values():
             lines += picture(results, pictures)
+    lines += ends_of_the_scale()
     for edition, of_edition in everything.items():
         lines += [f"## Numbers, {edition.called}", ""]
         curves = {name for name in of_edition if name.startswith("fig")}
