@@ -168,7 +168,7 @@ def differences(rulings: Rulings) -> list[str]:
 
 
 def ends_of_the_scale() -> list[str]:
-    """What random policies, a blind gait and trained policies clear on the Block tasks: the first tables of its page."""
+    """What random policies, a blind gait and trained policies clear on the Block tasks: the first two tables there."""
     tables = re.findall(r"(?:^\|.*\n)+", CALIBRATION.read_text(), re.MULTILINE)[:2]
     where = "From [environments/calibration.md](environments/calibration.md), which says how it is measured."
     return ["## How much the Block tasks allow", "", where, "", *tables]
