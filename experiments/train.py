@@ -78,7 +78,8 @@ def execute(run: Run) -> str:
     except Timeout:
         status = read_status(run.folder)
         soft = run.folder / ".lock.soft"
-        silent = f", which {SILENT}" if status["message"] == SILENT else ""
+        heard = status["state"] == "running" and status["message"] != SILENT
+        silent = "" if heard else f", which {SILENT}"
         stale = f" If it is gone, delete {soft}" if silent and soft.exists() else ""
         print(f"{run.run_id} is already running (host {status.get('host')}, pid {status.get('pid')}){silent}{stale}")
         return "running"

@@ -33,7 +33,7 @@ def learn(config: Any, make_envs: Any, log: RunLog, seed: int, checkpoint: Check
 
 def use(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let `learn` stand for every learner that is trained, and ask git nothing."""
-    monkeypatch.setattr(train, "algorithm", lambda name: types.SimpleNamespace(train=learn))
+    monkeypatch.setattr(train, "learner_of", lambda name: types.SimpleNamespace(train=learn))
     monkeypatch.setattr(manifest, "git", lambda *arguments: None)
 
 

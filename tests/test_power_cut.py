@@ -129,7 +129,7 @@ def test_a_run_whose_log_is_changed_while_it_trains_does_not_count_as_finished(r
         learn(config, make_envs, log, seed, checkpoint)
         (run.folder / "progress.csv").write_text("iteration\n")
 
-    monkeypatch.setattr(train, "algorithm", lambda name: types.SimpleNamespace(train=meddled))
+    monkeypatch.setattr(train, "learner_of", lambda name: types.SimpleNamespace(train=meddled))
     assert train.execute(run) == "failed"
     assert "somebody else changed it" in read_status(run.folder)["message"]
 
