@@ -83,7 +83,7 @@ class Sweep:
             "environments": self.over.get("env", [GROUPS["env"]]),
             "variants": variants,
             "seeds": self.seeds,
-            "committed_in": sorted(path.stem for path in (COMMITTED / self.edition.folder).glob("*.csv")),
+            "committed_in": [f for f in choices("figure") if (COMMITTED / self.edition.folder / f"{f}.csv").exists()],
             "sweep": dataclasses.asdict(self),
         }
 

@@ -313,6 +313,17 @@ def test_comparing_what_is_not_there_is_one_line(tmp_path, begun, capsys):
     assert not (tmp_path / "out").exists()
 
 
+def test_rows_that_are_committed_beside_figures_are_none_of_a_sweep(tmp_path, begun, capsys, monkeypatch):
+    committed = tmp_path / "data/smoke"
+    committed.mkdir(parents=True)
+    for name in ("fig3.csv", "fig3.runs.csv"):
+        (committed / name).write_text("figure,scale,env,variant,seed,run_id,env_steps,metric,value\n")
+    monkeypatch.setattr("experiments.own_sweep.COMMITTED", tmp_path / "data")
+    assert run(tmp_path, "--name", "lr", *GRID, *TINY) == 0
+    plan = json.loads((tmp_path / "runs/plans/smoke/lr.json").read_text())
+    assert plan["committed_in"] == ["fig3"]
+
+
 @pytest.mark.slow
 def test_a_sweep_is_planned_killed_resumed_and_compared(tmp_path, capsys):
     arguments = ["--name", "lr", *GRID, *TINY, "--seeds", "2", "--runs-dir", str(tmp_path / "runs")]
