@@ -205,7 +205,7 @@ def test_what_cannot_be_trained_is_refused_by_name(overrides, words):
 def test_unbounded_actions_and_pictures_are_refused():
     with pytest.raises(Refused, match="valid are bounded actions"):
         foreign._action_range("gym:X", gym.spaces.Box(-np.inf, np.inf, (2,)))
-    with pytest.raises(Refused, match=r"observes Box; valid are Boxes of at most two dimensions"):
+    with pytest.raises(Refused, match=r"observes Box; valid are Boxes of one dimension"):
         list(foreign._parts("gym:X", gym.spaces.Box(0, 255, (9, 9, 3), np.uint8)))
 
 

@@ -202,9 +202,9 @@ def _line(error: Exception) -> str:
 def _parts(name: str, space: gym.Space) -> Any:
     """(key, entries) of every part of an observation in the order in which it is flattened, that of its Dict."""
     for key, part in space.spaces.items() if isinstance(space, gym.spaces.Dict) else [("observation", space)]:
-        if not isinstance(part, gym.spaces.Box) or len(part.shape) > 2:
+        if not isinstance(part, gym.spaces.Box) or len(part.shape) != 1:
             what = part if isinstance(space, gym.spaces.Dict) else type(part).__name__
-            valid = "valid are Boxes of at most two dimensions and Dicts of them"
+            valid = "valid are Boxes of one dimension and Dicts of them"
             raise Refused("env", name, f"observes {what}; {valid}")
         yield key, int(np.prod(part.shape))
 
