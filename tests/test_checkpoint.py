@@ -113,3 +113,13 @@ def test_a_process_killed_while_saving_always_leaves_a_loadable_checkpoint(tmp_p
         assert state["iteration"] > last
         assert torch.equal(state["w"], torch.full((200_000,), float(state["iteration"])))
         last = state["iteration"]
+
+
+def test_what_was_loaded_is_saved_beside_something_new_as_the_same_bytes(tmp_path):
+    def fresh():
+        return {"state": {0: {"step": torch.ones(1)}}, "groups": [{"rate": 0.1}]}
+
+    save(tmp_path / "whole.pt", {"first": fresh(), "second": fresh()})
+    loaded = load(tmp_path / "whole.pt")
+    save(tmp_path / "mixed.pt", {"first": loaded["first"], "second": fresh()})
+    assert (tmp_path / "mixed.pt").read_bytes() == (tmp_path / "whole.pt").read_bytes()

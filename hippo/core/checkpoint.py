@@ -67,7 +67,16 @@ def load(path: Path) -> dict[str, Any]:
         raise CheckpointError(f"{path}: is no checkpoint ({' '.join(str(error).split())[:100]})") from None
     if not isinstance(content, dict):
         raise CheckpointError(f"{path}: is no checkpoint (it holds a {type(content).__name__})")
-    return content
+    return _interned(content)
+
+
+def _interned(content: Any) -> Any:
+    """The same with the keys that the code itself uses: of equal strings pickle writes what is one object once, so that
+    an optimiser's loaded state beside a new one's would be saved as other bytes than two new ones'.
+    """
+    if type(content) is dict:
+        return {sys.intern(key) if type(key) is str else key: _interned(value) for key, value in content.items()}
+    return [_interned(value) for value in content] if type(content) is list else content
 
 
 class Checkpoint:
