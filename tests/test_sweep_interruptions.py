@@ -92,29 +92,27 @@ def is_worker(process):
         return False
 
 
-@pytest.mark.parametrize(
-    ("figure", "kills"), [(FIGURE, 2), pytest.param(EIGHT, 6, marks=pytest.mark.slow)], ids=["two", "six"]
-)
-def test_workers_killed_at_random_leave_no_trace_once_the_command_was_typed_again(figure, kills, tmp_path, monkeypatch):
+@pytest.mark.slow
+def test_workers_killed_at_random_leave_no_trace_once_the_command_was_typed_again(tmp_path, monkeypatch):
     settings = ["iterations=25", "batch_size=400"]
-    monkeypatch.setattr("experiments.plan.load_figure", lambda name: figure)
+    monkeypatch.setattr("experiments.plan.load_figure", lambda name: EIGHT)
     runs = make_plan("tiny", "smoke", settings, False, tmp_path / "a/runs").todo()
     assert {train.execute(run) for run in runs} == {"finished"}
     (tmp_path / "b").mkdir()
     rng, killed, typed, process = random.Random(0), 0, 0, None
     deadline = time.monotonic() + 200
-    while len(finished(tmp_path / "b")) < len(runs) or killed < kills:
+    while len(finished(tmp_path / "b")) < len(runs) or killed < 6:
         assert time.monotonic() < deadline
         if process is None or process.poll() is not None:
-            process, typed = start_sweep(tmp_path / "b", 25, figure), typed + 1
+            process, typed = start_sweep(tmp_path / "b", 25, EIGHT), typed + 1
         time.sleep(rng.uniform(0.02, 0.2))
         workers = [child for child in psutil.Process(process.pid).children() if is_worker(child)]
         folders = [path.parent for path in (tmp_path / "b/runs").glob("*/status.json")]
         training = {status["pid"] for status in map(read_status, folders) if status["state"] == "running"}
-        if killed < kills and (chosen := [w for w in workers if w.pid in training]):
+        if killed < 6 and (chosen := [w for w in workers if w.pid in training]):
             rng.choice(chosen).kill()
             killed += 1
-    assert process.wait(60) == 0 or start_sweep(tmp_path / "b", 25, figure).wait(60) == 0
+    assert process.wait(60) == 0 or start_sweep(tmp_path / "b", 25, EIGHT).wait(60) == 0
     assert typed >= 2
     for run in runs:
         for name in ("progress.csv", "checkpoint.pt"):
