@@ -1,17 +1,15 @@
 """docs/adding.md, done: its blocks are put into a copy of the project and its commands are run there."""
 
 import os
-import re
 import shlex
 import shutil
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parent.parent
-BLOCK = re.compile(r"^```(\w+)(?: title=\"([^\"]+)\")?\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+from tests.pages import ROOT, blocks
+
 COPIED = (
     "analysis",
     "baselines",
@@ -45,7 +43,7 @@ def project(tmp_path_factory):
             shutil.copy(source, root / name)
     environment = os.environ | {"PYTHONPATH": str(root), "XDG_CACHE_HOME": str(root / "cache")}
     said = ""
-    for kind, title, block in BLOCK.findall((ROOT / "docs/adding.md").read_text()):
+    for kind, title, block in blocks("adding.md"):
         if kind == "sh":
             for line in block.splitlines():
                 python, *rest = shlex.split(line)

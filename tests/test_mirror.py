@@ -33,6 +33,18 @@ def progress(folder):
         return {int(row["iteration"]): {k: float(v) for k, v in row.items()} for row in csv.DictReader(file)}
 
 
+def killed_once(command, is_time):
+    """Start a training with one mirror and kill it when `is_time`; the mirror ends by itself."""
+    process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    while not is_time():
+        assert process.poll() is None
+        time.sleep(0.05)
+    (child,) = [p for p in psutil.Process(process.pid).children() if "hippo.core.mirror" in p.cmdline()]
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    child.wait(20)
+
+
 @pytest.fixture
 def no_account(monkeypatch, tmp_path):
     """No key anywhere wandb looks for one."""
@@ -47,14 +59,7 @@ def test_after_kills_the_offline_logs_together_hold_exactly_the_rows_of_progress
     command = [sys.executable, "-m", "experiments.train", *arguments, "wandb.mode=offline"]
     run = compose_run(arguments)
     for stop_at in (60, 120):
-        process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        while len(history(run.folder)) < stop_at:
-            assert process.poll() is None
-            time.sleep(0.05)
-        (child,) = [p for p in psutil.Process(process.pid).children() if "hippo.core.mirror" in p.cmdline()]
-        process.send_signal(signal.SIGKILL)
-        process.wait()
-        child.wait(20)  # ends by itself
+        killed_once(command, lambda at=stop_at: len(history(run.folder)) >= at)
         mirrored = history(run.folder)
         assert stop_at <= len(mirrored) < len(progress(run.folder)) < 300  # the last row may be dropped by a resume
         assert mirrored.items() <= progress(run.folder).items()
@@ -192,14 +197,7 @@ def test_after_a_kill_tensorboard_shows_exactly_the_rows_of_progress_csv_once(tm
     arguments = ["env=block_hopper", "scale=smoke", "iterations=60", "batch_size=400", f"runs_dir={tmp_path}"]
     command = [sys.executable, "-m", "experiments.train", *arguments, "log.tensorboard=true"]
     run = compose_run(arguments)
-    process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    while read_status(run.folder)["iteration"] < 15:
-        assert process.poll() is None
-        time.sleep(0.05)
-    (child,) = [p for p in psutil.Process(process.pid).children() if "hippo.core.mirror" in p.cmdline()]
-    process.send_signal(signal.SIGKILL)
-    process.wait()
-    child.wait(20)  # ends by itself
+    killed_once(command, lambda: read_status(run.folder)["iteration"] >= 15)
     assert scalars(run.folder).items() <= in_single_precision(run.folder).items()
     assert subprocess.run(command, cwd=ROOT, capture_output=True, check=False).returncode == 0
     assert read_status(run.folder)["state"] == "finished"

@@ -1,8 +1,5 @@
 """docs/own_sweep.md, done: its files are written, its commands are run; Optuna, which is not installed, is played."""
 
-import importlib
-import runpy
-import shlex
 import sys
 import types
 
@@ -10,7 +7,7 @@ import pytest
 
 from experiments import sweep
 from experiments.train import execute
-from tests.test_adding import BLOCK, ROOT
+from tests.pages import blocks, follow
 
 
 class Trial:
@@ -36,24 +33,12 @@ class Study:
 @pytest.fixture
 def page(tmp_path, monkeypatch, capsys):
     """What was printed by all that the page says."""
-    monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("paper_figures.compare.OUT", tmp_path / "out")
     # No processes: importing torch in each would take longer than all that they train.
     monkeypatch.setattr(sweep, "run_locally", lambda todo, *_: {run.run_id: execute(run) for run in todo})
     optuna = types.SimpleNamespace(create_study=lambda **_: Study(), TrialPruned=RuntimeError)
     monkeypatch.setitem(sys.modules, "optuna", optuna)
-    for kind, title, block in BLOCK.findall((ROOT / "docs/own_sweep.md").read_text()):
-        if kind != "sh":
-            (tmp_path / title).write_text(block)
-            continue
-        for line in block.splitlines():
-            python, *rest = shlex.split(line)
-            assert python == "python"
-            if rest[0] == "-m":
-                assert importlib.import_module(rest[1]).main(rest[2:]) == 0, line
-            else:
-                runpy.run_path(rest[0], run_name="__main__")
-    return capsys.readouterr().out
+    return follow("own_sweep.md", tmp_path, monkeypatch, capsys)
 
 
 def test_the_page_does_what_it_says(page, tmp_path):
@@ -65,5 +50,5 @@ def test_the_page_does_what_it_says(page, tmp_path):
 
 
 def test_the_part_about_optuna_is_as_short_as_it_says():
-    (code,) = [b for k, t, b in BLOCK.findall((ROOT / "docs/own_sweep.md").read_text()) if t == "tune.py"]
+    (code,) = [b for k, t, b in blocks("own_sweep.md") if t == "tune.py"]
     assert len([line for line in code.splitlines() if line.strip()]) <= 20
