@@ -15,6 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from hippo.core import seeding
+from hippo.core.acting import OfHorizons
 from hippo.core.checkpoint import Checkpoint
 from hippo.core.direct import Gaussian, SquaredError, network_of
 from hippo.core.gae import segment_gae
@@ -58,7 +59,7 @@ class PPOConfig(SurrogateConfig):
             self.discount_per_step = False  # the same either way, so one run and not two
 
 
-class Acting:
+class Acting(OfHorizons):
     """The policy at work (`hippo.core.acting.Acting`); with `greedy` it takes its mean action."""
 
     def __init__(
@@ -75,17 +76,16 @@ class Acting:
         self._act, self._view = policy.actor(), actor_of(policy.filter)
         self._action = torch.empty(self._shape[1:]).numpy()
         self.steps_left = np.zeros(num_envs, np.int64)  # (N,) for which the action is held
-        self._draw(seed, iteration)
+        super().__init__(config.horizon, seed, iteration)
 
     def _draw(self, seed: int, iteration: int) -> None:
-        self._seed, self._iteration, self._t = seed, iteration, 0
+        """T rows of what is added to actions."""
         self._noise = torch.randn(self._shape, generator=seeding.torch_generator(seed, "policy", iteration)).numpy()
         self._noise *= not self.greedy
 
     def act(self, obs: np.ndarray) -> np.ndarray:
         """Actions (N, A), new ones where none is held."""
-        if self._t == self.config.horizon:
-            self._draw(self._seed, self._iteration + 1)
+        self._next_horizon_if_over()
         seen, noise = self._view(obs), self._noise[self._t]
         self.is_decision = self.steps_left == 0
         where = np.flatnonzero(self.is_decision)

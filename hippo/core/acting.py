@@ -27,6 +27,25 @@ class Acting(Protocol):
         """The step is over, and with it the episodes where `done` (N,)."""
 
 
+class OfHorizons:
+    """An `Acting` whose randomness is drawn a horizon at a time."""
+
+    def __init__(self, horizon: int, seed: int, iteration: int) -> None:
+        self._horizon, self._seed, self._iteration = horizon, seed, iteration
+        self._t = 0  # steps of this horizon taken
+        self._draw(seed, iteration)
+
+    def _draw(self, seed: int, iteration: int) -> None:
+        """Draw what one horizon of T steps needs, every purpose from a stream of its own."""
+        raise NotImplementedError
+
+    def _next_horizon_if_over(self) -> None:
+        """To be called before a step."""
+        if self._t == self._horizon:
+            self._t, self._iteration = 0, self._iteration + 1
+            self._draw(self._seed, self._iteration)
+
+
 def parts_that_act(path: Path) -> dict[str, Any]:
     """The content of a checkpoint without what only training needs.
 

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from hippo.core import seeding
+from hippo.core.acting import OfHorizons
 from hippo.core.checkpoint import Checkpoint
 from hippo.core.direct import Categorical, Gaussian, network_of
 from hippo.core.networks import normalize_columns
@@ -229,7 +230,7 @@ class Batch:
     used: Tensor  # (T, N) is learnt from; all true unless truncate_to_period
 
 
-class Acting:
+class Acting(OfHorizons):
     """Algorithm 1 without its learning: the hierarchy at work (`hippo.core.acting.Acting`).
 
     Periods, the manager's uniforms and the skills' Gaussian noise have a stream each, so what one level draws never
@@ -248,11 +249,10 @@ class Acting:
         self.policy, self.config, self.greedy = policy, config, greedy
         self.commitment = Commitment(policy, num_envs, config.period_max)
         self._skills, self._view, self._everywhere = policy.skills.actor(), actor_of(policy.filter), np.arange(num_envs)
-        self._draw(seed, iteration)
+        super().__init__(config.horizon, seed, iteration)
 
     def _draw(self, seed: int, iteration: int) -> None:
-        """The randomness of a horizon of T steps; T + 1 rows of what is decided before a step."""
-        self._seed, self._iteration, self.t = seed, iteration, 0
+        """T + 1 rows of what is decided before a step, T of what is added to actions."""
         (T, N), config = (self.config.horizon, len(self._everywhere)), self.config
         generator = seeding.torch_generator(seed, "period", iteration)
         self._period = torch.randint(config.period_min, config.period_max + 1, (T + 1, N), generator=generator).numpy()
@@ -274,25 +274,24 @@ class Acting:
     def decide(self, obs: np.ndarray) -> np.ndarray:
         """See `obs` (N, D), and choose a skill where a commitment has run out; returns where, (N,) bool."""
         self._seen = self._view(obs)
-        return self.commitment.renew(self._seen, self._period[self.t], None if self.greedy else self._uniform[self.t])
+        return self.commitment.renew(self._seen, self._period[self._t], None if self.greedy else self._uniform[self._t])
 
     def action(self) -> np.ndarray:
         """What the skills in force do (N, A) about what was last seen."""
         policy, time_left = self.policy, self.commitment.time_left
         seen = look(self._seen, time_left, self._everywhere, policy.skill_view, policy.sees_time)
-        return self._skills(seen, self.skill, self._noise[self.t])
+        return self._skills(seen, self.skill, self._noise[self._t])
 
     def act(self, obs: np.ndarray) -> np.ndarray:
         """Decide and act."""
-        if self.t == self.config.horizon:
-            self._draw(self._seed, self._iteration + 1)
+        self._next_horizon_if_over()
         self.decide(obs)
         return self.action()
 
     def end(self, done: np.ndarray) -> None:
         """One step has passed; an episode's end cuts the commitment."""
         self.commitment.advance(done)
-        self.t += 1
+        self._t += 1
 
 
 @torch.no_grad()

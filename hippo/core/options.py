@@ -13,6 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from hippo.core import seeding
+from hippo.core.acting import OfHorizons
 from hippo.core.networks import for_few_rows, mlp
 from hippo.core.normalize import ObservationFilter
 from hippo.core.policies import Manager, SkillPolicy, sample_categorical
@@ -74,7 +75,7 @@ class Options:
     begins: Tensor  # (T + 1, N) bool, an episode begins here
 
 
-class Acting:
+class Acting(OfHorizons):
     """Call-and-return in N environments (`hippo.core.acting.Acting`).
 
     With `greedy` every level takes its most likely choice: mean action, likeliest option, termination where its
@@ -84,19 +85,18 @@ class Acting:
     def __init__(
         self, policy: OptionPolicy, config: Any, num_envs: int, seed: int, iteration: int, greedy: bool = False
     ) -> None:
-        self.policy, self.horizon, self.greedy = policy, config.horizon, greedy
+        self.policy, self.greedy = policy, greedy
         self._everywhere = np.arange(num_envs)
         self.skill = np.zeros(num_envs, np.int64)  # (N,) the option in force
         self.begins = np.ones(num_envs, bool)  # (N,) an episode begins with what is seen next
-        self._draw(seed, iteration)
+        super().__init__(config.horizon, seed, iteration)
         self._renew_networks()
 
     def _draw(self, seed: int, iteration: int) -> None:
-        """The randomness of a horizon of T steps; T + 1 rows of what is decided before a step."""
-        self._seed, self._iteration, self._t = seed, iteration, 0
+        """T + 1 rows of what is decided before a step, T of what is added to actions."""
         purposes = ("skills", "manager", "termination")
         skills, manager, termination = (seeding.torch_generator(seed, purpose, iteration) for purpose in purposes)
-        T, N = self.horizon, len(self._everywhere)
+        T, N = self._horizon, len(self._everywhere)
         shape = (T, N, self.policy.skills.log_std_parameter.shape[-1])
         self._noise = torch.randn(shape, generator=skills).numpy() * (not self.greedy)
         self._choice = torch.rand(T + 1, N, generator=manager).numpy()
@@ -131,8 +131,7 @@ class Acting:
 
     def act(self, obs: np.ndarray) -> np.ndarray:
         """Decide and act."""
-        if self._t == self.horizon:
-            self._draw(self._seed, self._iteration + 1)
+        self._next_horizon_if_over()
         self.decide(obs)
         return self.action()
 
