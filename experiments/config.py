@@ -27,7 +27,9 @@ from experiments import synonyms
 from hippo.core.settings import ConfigError, setting
 from hippo.core.skills import SkillsError, read_skills
 from hippo.envs import ENVIRONMENTS, environment, foreign
-from hippo.envs.registration import Options, check_options, option
+from hippo.envs.arguments import Refused
+from hippo.envs.foreign import ForeignOptions
+from hippo.envs.registration import Options, check_options
 from hippo.learners import LEARNERS, config_class, learner_of
 
 CONF = Path(__file__).parent / "conf"
@@ -59,14 +61,6 @@ ONE_VALUE = "must be key=value with one value; several make a sweep: experiments
 WANDB_MODES = ("disabled", "offline", "online")
 
 installed = functools.cache(version)  # reading a package's metadata takes 3 ms, and a plan asks a thousand times
-
-
-@dataclass
-class ForeignOptions:
-    """What an environment of Gymnasium's registry, `gym:<id>`, can be told."""
-
-    kwargs: dict[str, Any] = option({}, "gym: arguments of the environment, as {name: value, ...}")
-    skill_view: str = option("", "gym: what skills see, entries a:b or names separated by commas; empty: everything")
 
 
 @dataclass
@@ -420,7 +414,7 @@ def group_choices(group: str) -> list[str]:
 
 def _check_group(group: str, value: str) -> str:
     if group == "env" and foreign.is_foreign(value):
-        with _of_environment(value, {}):
+        with _of_environment():
             environment(value)
         return value
     valid = group_choices(group)
@@ -466,16 +460,12 @@ def _as_config_error(key: str, value: Any) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _of_environment(env: str, options: dict[str, Any]) -> Iterator[None]:
+def _of_environment() -> Iterator[None]:
     """Name what an environment refuses, itself or one of its options, by its key in the whole configuration."""
     try:
         yield
-    except foreign.Refused as error:
+    except Refused as error:
         raise ConfigError("env" if error.key == "env" else f"env.{error.key}", error.value, error.valid) from error
-    except ValueError as error:
-        setting, valid = str(error).split(": ", 1)
-        key = setting.split("=", 1)[0]
-        raise ConfigError(f"env.{key}", options[key], valid) from error
 
 
 def option_fields() -> list[dataclasses.Field]:
@@ -493,7 +483,7 @@ def _of_algo() -> Iterator[None]:
     """Name a setting that an algorithm refuses by its key in the whole configuration."""
     try:
         yield
-    except (ConfigError, foreign.Refused) as error:
+    except (ConfigError, Refused) as error:
         raise ConfigError(f"{level_of(error.key)}{error.key}", error.value, error.valid) from error
 
 
@@ -524,7 +514,7 @@ def _validated(config: DictConfig, algo: str, names: dict[str, str]) -> Run:
     with _of_algo():
         settings = config_class(algo)(**plain["algo"])
     options = {f.name: env[f.name] for f in option_fields() if env[f.name] != default_of(f)}
-    with _of_environment(env["name"], options):
+    with _of_environment():
         check_options(env["name"], options)
     if hasattr(settings, "check_environment"):
         layout = foreign.layout_of(env["name"], options) if foreign.is_foreign(env["name"]) else None

@@ -32,7 +32,8 @@ from hippo.core.acting import rollout
 from hippo.core.checkpoint import Checkpoint, CheckpointError
 from hippo.core.episodes import opening_episodes
 from hippo.core.settings import ConfigError
-from hippo.envs import foreign, make
+from hippo.envs import make
+from hippo.envs.arguments import Refused
 from hippo.envs.registration import Options
 from hippo.learners import learner_of
 
@@ -102,23 +103,19 @@ def load_finished_run(folder: Path) -> Run:
     return run
 
 
-def environments(run: Run, num_envs: int, seed: int, **changes: Any) -> Any:
-    """The environments of `run`, for its evaluation; `changes` as in `evaluate`.
+def environments(run: Run, num_envs: int, seed: int, render_mode: str | None = None, **changes: Any) -> Any:
+    """The environments of `run`, for its evaluation; `render_mode` of a gym:<id>, `changes` as in `evaluate`.
 
     Raises:
         ConfigError: there is nothing trained, or no such option.
     """
     if not (run.folder / "checkpoint.pt").exists():
         raise ConfigError("run", run.folder, "has no checkpoint; train it first")
-    options = changed_options(run, changes)
+    how = {"horizon": run.config.horizon, "render_mode": render_mode} | changed_options(run, changes)
     try:
-        return make(run.env, num_envs, seeding.integer(seed, "evaluation"), horizon=run.config.horizon, **options)
-    except foreign.Refused as error:
+        return make(run.env, num_envs, seeding.integer(seed, "evaluation"), **how)
+    except Refused as error:
         raise ConfigError(error.key, error.value, error.valid) from error
-    except ValueError as error:
-        setting, _, valid = str(error).partition(": ")
-        key, _, value = setting.partition("=")
-        raise ConfigError(key, value, valid) from error
 
 
 def changed_options(run: Run, changes: dict[str, Any]) -> dict[str, Any]:

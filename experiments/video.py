@@ -84,12 +84,11 @@ def record(run: Run, path: Path, seed: int, greedy: bool, **changes: Any) -> flo
     Raises:
         ConfigError: there is nothing trained, or no such option. NoOpenGL: nothing here can draw.
     """
-    envs = environments(run, 1, seed, **changes)
-    if isinstance(envs, foreign.GymnasiumEnv):
+    render_mode = None
+    if foreign.is_foreign(run.env):  # draws itself
         os.environ.setdefault("MUJOCO_GL", open_gl())
-        envs.close()
-        how = run.options | {"render_mode": "rgb_array"}
-        envs = foreign.make(run.env, 1, seeding.integer(seed, "evaluation"), run.config.horizon, **how)
+        render_mode = "rgb_array"
+    envs = environments(run, 1, seed, render_mode, **changes)
     with streamed(path) as write:
         recorded = Recorded(envs, write, run.config.horizon)
         streams = seeding.integer(seed, "evaluation of a policy")

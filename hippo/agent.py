@@ -148,21 +148,15 @@ class Agent:
 
     def _rows(self, obs: Any) -> tuple[np.ndarray, bool]:
         """(N, D) float32 and whether it was one observation."""
-        layout, size = self.task.layout, len(self.task.observation_names)
-        if layout is not None and layout.keys:
-            parts = [np.asarray(obs[key]) for key in layout.keys]
-            entries = [sum(name.split("[")[0] == key for name in layout.flat) for key in layout.keys]
-            count = parts[0].size // entries[0]
-            if any(part.size != count * n for part, n in zip(parts, entries, strict=True)):
-                shapes = {key: part.shape for key, part in zip(layout.keys, parts, strict=True)}
-                raise ValueError(f"obs has shapes {shapes}: must be of the spaces that were trained in")
-            return layout.rows(obs, count), parts[0].ndim == 1
-        array = np.asarray(obs)
-        if array.shape[-1:] != (size,) or array.ndim > 2:
-            raise ValueError(f"obs has shape {array.shape}: must be ({size},) or (N, {size})")
-        count = array.size // size
-        rows = layout.rows(array, count) if layout is not None else array.reshape(count, size).astype(np.float32)
-        return rows, array.ndim == 1
+        layout = self.task.layout
+        parts = [np.asarray(obs[key]) for key in layout.keys] if layout and layout.keys else [np.asarray(obs)]
+        sizes = layout.sizes if layout else [len(self.task.observation_names)]
+        is_one, count = parts[0].ndim == 1, len(np.atleast_2d(parts[0]))
+        for part, size in zip(parts, sizes, strict=True):
+            if part.shape != ((size,) if is_one else (count, size)):
+                raise ValueError(f"obs has shape {part.shape}: must be ({size},) or (N, {size})")
+        rows = layout.rows(obs, count) if layout else parts[0].reshape(count, -1).astype(np.float32)
+        return rows, is_one
 
     def save(self, folder: str | Path) -> Path:
         """Write the policy to `folder`, which `load` takes: tensors, what they are, and a card to read; returns it."""

@@ -4,6 +4,7 @@ Observations become one row of numbers, actions lie in [-1, 1], and an episode t
 same step, its last observation in `info["final_obs"]`. What cannot be had so is refused by name.
 """
 
+import dataclasses
 import difflib
 import functools
 import importlib
@@ -21,6 +22,8 @@ import numpy as np
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
+from hippo.envs.arguments import Refused, option
+
 PREFIX = "gym:"
 # Packages that register environments when they are imported: module -> what is installed, and how its ids begin.
 PACKAGES = {
@@ -28,20 +31,22 @@ PACKAGES = {
     "ale_py": ("ale-py", ("ALE/",)),
     "minigrid": ("minigrid", ("MiniGrid-", "BabyAI-")),
 }
-OPTIONS = ("kwargs", "skill_view")
 REVISION = 1  # bumped when what is made of an environment here changes
-
-
-class Refused(ValueError):
-    """An environment or an option that cannot be had: the message names the key, the value and what is valid."""
-
-    def __init__(self, key: str, value: object, valid: str) -> None:
-        self.key, self.value, self.valid = key, value, valid
-        super().__init__(f"{key}={value}: {valid}")
 
 
 class EnvironmentFault(RuntimeError):
     """An environment did what none may do: the message says which, where and when."""
+
+
+@dataclass
+class ForeignOptions:
+    """What an environment of Gymnasium's registry can be told."""
+
+    kwargs: dict[str, Any] = option({}, "gym: arguments of the environment, as {name: value, ...}")
+    skill_view: str = option("", "gym: what skills see, entries a:b or names separated by commas; empty: everything")
+
+
+OPTIONS = tuple(field.name for field in dataclasses.fields(ForeignOptions))
 
 
 @dataclass(frozen=True)
@@ -52,6 +57,7 @@ class Layout:
     """
 
     keys: Sequence[str]  # parts of a Dict observation as they are flattened; empty for a Box
+    sizes: Sequence[int]  # entries of every part, or of the Box
     flat: Sequence[str]  # names of the flattened observation's entries
     order: Sequence[int]  # (D,) which of them each entry of a row is
     view: int  # how many entries of a row skills see
@@ -59,10 +65,18 @@ class Layout:
     half: Sequence[float]  # (A,) half of its width
     dtype: str  # of actions
 
-    @property
+    @functools.cached_property
     def names(self) -> list[str]:
         """(D,) of the entries of a row."""
         return [self.flat[i] for i in self.order]
+
+    @functools.cached_property
+    def _order(self) -> np.ndarray:
+        return np.array(self.order)
+
+    @functools.cached_property
+    def _range(self) -> tuple[np.ndarray, np.ndarray]:
+        return np.array(self.middle), np.array(self.half)
 
     def find(self, key: str, text: str) -> list[int]:
         """Where in a row the entries stand that `text`, the value of `key`, lists as `skill_view` does.
@@ -76,11 +90,12 @@ class Layout:
         """(count, D) float32 of a batch of observations."""
         parts = [observation[key] for key in self.keys] if self.keys else [observation]
         flat = np.concatenate([np.asarray(part).reshape(count, -1) for part in parts], 1)
-        return flat[:, self.order].astype(np.float32)
+        return flat[:, self._order].astype(np.float32)
 
     def scaled(self, actions: np.ndarray) -> np.ndarray:
         """Actions (N, A), clipped to [-1, 1], in the environment's range."""
-        return (np.array(self.middle) + np.array(self.half) * np.clip(actions, -1, 1)).astype(self.dtype)
+        middle, half = self._range
+        return (middle + half * np.clip(actions, -1, 1)).astype(self.dtype)
 
 
 def is_foreign(name: str) -> bool:
@@ -186,6 +201,7 @@ def layout_of_spaces(name: str, observation: gym.Space, action: gym.Space, skill
     low, high = _action_range(name, action)
     return Layout(
         tuple(key for key, _ in parts) if isinstance(observation, gym.spaces.Dict) else (),
+        tuple(size for _, size in parts),
         tuple(flat),
         (*seen, *(i for i in range(len(flat)) if i not in set(seen))),
         len(seen),
@@ -263,7 +279,7 @@ class GymnasiumEnv(gym.vector.VectorEnv):
             raise Refused("env", name, f"its vector environment resets by {mode}; needed is {AutoresetMode.SAME_STEP}")
         self.envs, self.layout, self.metadata, self.num_envs = envs, layout, envs.metadata, envs.num_envs
         self.robot_name, self.observation_variant = name, skill_view
-        self.robot_size, self.observation_names = layout.view, layout.names
+        self.robot_size, self.observation_names = layout.view, list(layout.names)
         bound = np.full(len(layout.order), np.inf, np.float32)
         self.single_observation_space = gym.spaces.Box(-bound, bound, dtype=np.float32)
         self.single_action_space = gym.spaces.Box(-1.0, 1.0, (len(layout.half),), np.float32)

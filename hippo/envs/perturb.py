@@ -9,6 +9,8 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from hippo.envs.arguments import Refused
+
 PERTURBATIONS = ("mass", "damping", "inertia", "friction")
 STRENGTHS = ("original", "all")
 ALL_FACTOR = 1.5
@@ -48,7 +50,8 @@ def change_of(robot: str, quantity: str, strength: str, spec: mujoco.MjSpec) -> 
     """
     if strength == "original":
         if robot not in ORIGINAL:
-            raise ValueError(f"strength=original: defined for {', '.join(ORIGINAL)}, not for {robot}; use strength=all")
+            valid = f"defined for {', '.join(ORIGINAL)}, not for {robot}; use strength=all"
+            raise Refused("strength", "original", valid)
         return ORIGINAL[robot][quantity]
     elements = {"mass": spec.bodies, "inertia": spec.bodies, "damping": spec.joints, "friction": spec.geoms}[quantity]
     names = tuple(e.name for e in elements if e.name != "world" and not e.name.startswith("block_"))

@@ -8,20 +8,13 @@ import gymnasium as gym
 import numpy as np
 
 from hippo.envs import foreign
-from hippo.envs.arguments import LARGEST_INT, LARGEST_LONG, autoreset_mode, natural, plain
+from hippo.envs.arguments import LARGEST_INT, LARGEST_LONG, Refused, autoreset_mode, natural, option, plain
 from hippo.envs.blocks import Blocks
 from hippo.envs.gather import Gather
 from hippo.envs.locomote import SURVIVAL, Locomotion
 from hippo.envs.perturb import PERTURBATIONS, STRENGTHS
 from hippo.envs.robots import ROBOTS
 from hippo.envs.vector import RobotTaskEnv
-
-
-def option(default: Any, doc: str) -> Any:
-    """A field of Options with its meaning."""
-    if isinstance(default, dict):
-        return dataclasses.field(default_factory=lambda: dict(default), metadata={"doc": doc})
-    return dataclasses.field(default=default, metadata={"doc": doc})
 
 
 @dataclass
@@ -105,7 +98,7 @@ def environment(name: str) -> Environment:
         horizon, package = spec.max_episode_steps or 0, foreign.package(spec)
         return Environment(name, None, horizon, foreign.REVISION, options, package)
     if name not in ENVIRONMENTS:
-        raise ValueError(f"env={name}: must be one of {', '.join(ENVIRONMENTS)} or gym:<id>")
+        raise Refused("env", name, f"must be one of {', '.join(ENVIRONMENTS)} or gym:<id>")
     return ENVIRONMENTS[name]
 
 
@@ -116,6 +109,7 @@ def make(
     num_threads: int = 1,
     horizon: int | None = None,
     autoreset: bool | str | gym.vector.AutoresetMode = True,
+    render_mode: str | None = None,
     **options: Any,
 ) -> Any:
     """Build a vector environment, a RobotTaskEnv or for `gym:<id>` a GymnasiumEnv.
@@ -125,7 +119,8 @@ def make(
         num_threads: that MuJoCo steps on, in ENVIRONMENTS; results do not depend on it.
         horizon: steps to truncation instead of the environment's own. autoreset: whether ended episodes are followed
         by new ones in the same step (True), when the caller resets them (False), or a mode of Gymnasium's by its value
-        ("NextStep": in the next step). options: fields of Options. numpy's scalars count as Python's.
+        ("NextStep": in the next step). render_mode: Gymnasium's, of `gym:<id>` only.
+        options: fields of Options. numpy's scalars count as Python's.
 
     Raises:
         ValueError: a name, option or value that does not exist; the message names it and the valid ones.
@@ -136,8 +131,10 @@ def make(
     horizon = natural("horizon", found.horizon if horizon is None else horizon, 1, LARGEST_LONG)
     if foreign.is_foreign(name):
         if autoreset_mode(autoreset) is not gym.vector.AutoresetMode.SAME_STEP:
-            raise ValueError(f"autoreset={autoreset}: {name} has SameStep here; gymnasium.make_vec has the others")
-        return foreign.make(name, num_envs, seed, horizon, **options)
+            raise Refused("autoreset", autoreset, f"{name} has SameStep here; gymnasium.make_vec has the others")
+        return foreign.make(name, num_envs, seed, horizon, render_mode=render_mode, **options)
+    if render_mode is not None:
+        raise Refused("render_mode", render_mode, "a vector environment has none; use gymnasium.make")
     return RobotTaskEnv(
         ROBOTS[found.robot],
         found.task,
@@ -170,10 +167,10 @@ def make_single(name: str, render_mode: str | None = None, seed: int | None = No
     limit = ENVIRONMENTS[name].horizon
     for key, instead in (("num_envs", "gymnasium.make_vec makes several"), ("autoreset", "call reset()")):
         if key in options:
-            raise ValueError(f"{key}={options[key]}: gymnasium.make takes none; {instead}")
+            raise Refused(key, options[key], f"gymnasium.make takes none; {instead}")
     options["horizon"] = LARGEST_LONG if options.get("horizon") is None else natural("horizon", options["horizon"], 1)
     if limit < options["horizon"] < LARGEST_LONG:
-        raise ValueError(f"horizon={options['horizon']}: gymnasium.make ends it after {limit}; give max_episode_steps")
+        raise Refused("horizon", options["horizon"], f"gymnasium.make ends it after {limit}; give max_episode_steps")
     return SingleEnv(make(name, 1, entropy() if seed is None else seed, autoreset=False, **options), render_mode)
 
 
@@ -193,14 +190,12 @@ def make_several(
     Raises:
         ValueError: what `make` refuses; a render mode, since a single environment renders; two different horizons.
     """
-    if render_mode is not None:
-        raise ValueError(f"render_mode={render_mode}: a vector environment has none; use gymnasium.make")
     if max_episode_steps is not None:
         limit = natural("max_episode_steps", max_episode_steps, 1, LARGEST_LONG)
         horizon = options.setdefault("horizon", limit)
         if limit not in (ENVIRONMENTS[name].horizon, horizon):
-            raise ValueError(f"max_episode_steps={limit}: is the horizon, which is given as {horizon}")
-    return make(name, num_envs, entropy() if seed is None else seed, **options)
+            raise Refused("max_episode_steps", limit, f"is the horizon, which is given as {horizon}")
+    return make(name, num_envs, entropy() if seed is None else seed, render_mode=render_mode, **options)
 
 
 def entropy() -> int:
@@ -226,9 +221,9 @@ def check_option(name: str, key: str, value: Any) -> Any:
     if key not in valid:
         hint = RENAMED.get(key)
         instead = f"its name here is {hint}" if hint else f"its options are {', '.join(valid)}"
-        raise ValueError(f"{key}={value}: {name} has no such option; {instead}")
+        raise Refused(key, value, f"{name} has no such option; {instead}")
     if not any(type(value) is type(one) and value == one for one in valid[key]):
-        raise ValueError(f"{key}={value}: {name} takes one of {', '.join(map(str, valid[key]))}")
+        raise Refused(key, value, f"{name} takes one of {', '.join(map(str, valid[key]))}")
     return value
 
 
@@ -238,5 +233,5 @@ def check_options(name: str, options: dict[str, Any]) -> dict[str, Any]:
         return foreign.check(name, options)
     options = {key: check_option(name, key, value) for key, value in options.items()}
     if options.get("strength", Options.strength) != Options.strength and options.get("perturbation") is None:
-        raise ValueError(f"strength={options['strength']}: changes nothing without a perturbation")
+        raise Refused("strength", options["strength"], "changes nothing without a perturbation")
     return options

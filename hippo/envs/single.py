@@ -5,7 +5,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from hippo.envs.arguments import natural
+from hippo.envs.arguments import Refused, natural
 from hippo.envs.rendering import Renderer
 from hippo.envs.vector import RENDER_MODES, RobotTaskEnv
 
@@ -23,7 +23,7 @@ class SingleEnv(gym.Env):
 
     def __init__(self, envs: RobotTaskEnv, render_mode: str | None = None) -> None:
         if render_mode not in (None, *RENDER_MODES):
-            raise ValueError(f"render_mode={render_mode}: must be one of None, {', '.join(RENDER_MODES)}")
+            raise Refused("render_mode", render_mode, f"must be one of None, {', '.join(RENDER_MODES)}")
         self.envs, self.render_mode, self.metadata = envs, render_mode, envs.metadata
         self.observation_space, self.action_space = envs.single_observation_space, envs.single_action_space
         self._renderer: Renderer | None = None
