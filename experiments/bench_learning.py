@@ -25,6 +25,7 @@ from hippo.core.checkpoint import Checkpoint
 from hippo.core.log import Row as LogRow
 from hippo.core.log import RunLog
 from hippo.envs import gymnasium_id
+from hippo.envs.foreign import PREFIX, is_foreign
 from hippo.learners import learner_of
 
 GOALS = {"block_hopper": 5.0, "block_half_cheetah": 2.0}  # walls, whose time is taken
@@ -40,7 +41,7 @@ class Point:
 
     steps: int  # environment steps so far
     seconds: float  # of its own turns so far
-    walls: float  # undiscounted return of the episodes that ended in this iteration; NaN for none
+    walls: float  # undiscounted return of the episodes that ended in this iteration, on other tasks, too; NaN for none
 
 
 Report = Callable[[Point], None]
@@ -62,15 +63,20 @@ def ours(overrides: Sequence[str], report: Report) -> None:
         learner_of(run.algo).train(run.config, prepare(run), log, run.seed, checkpoint)
 
 
-def stable_baselines(name: str, seed: int, report: Report) -> None:
-    """Train Stable-Baselines3's PPO with VecNormalize without end."""
+def peer(name: str, seed: int) -> Any:
+    """Stable-Baselines3's PPO with VecNormalize on one of our tasks or on gym:<id>, untrained."""
     from stable_baselines3 import PPO
     from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
     torch.set_num_threads(1)
-    envs = VecMonitor(DummyVecEnv([functools.partial(registered, gymnasium_id(name))] * NUM_ENVS))
+    env_id = name.removeprefix(PREFIX) if is_foreign(name) else gymnasium_id(name)
+    envs = VecMonitor(DummyVecEnv([functools.partial(registered, env_id)] * NUM_ENVS))
     settings: dict[str, Any] = {"n_steps": STEPS, "batch_size": 256, "gamma": 0.999}  # the others are its defaults
-    learner = PPO("MlpPolicy", VecNormalize(envs, gamma=0.999), **settings, device="cpu", seed=seed)
+    return PPO("MlpPolicy", VecNormalize(envs, gamma=0.999), **settings, device="cpu", seed=seed)
+
+
+def train_peer(learner: Any, report: Report) -> None:
+    """Train it without end."""
     clock, steps = 0.0, 0
     while True:
         began = time.perf_counter()
@@ -78,7 +84,12 @@ def stable_baselines(name: str, seed: int, report: Report) -> None:
         clock, steps = clock + time.perf_counter() - began, steps + NUM_ENVS * STEPS
         ended = [episode["r"] for episode in learner.ep_info_buffer or ()]
         report(Point(steps, clock, float(np.mean(ended)) if ended else float("nan")))
-        learner.ep_info_buffer.clear()  # type: ignore[union-attr]
+        learner.ep_info_buffer.clear()
+
+
+def stable_baselines(name: str, seed: int, report: Report) -> None:
+    """Train Stable-Baselines3's PPO with VecNormalize without end."""
+    train_peer(peer(name, seed), report)
 
 
 def race(name: str, seed: int, budget: int) -> dict[str, list[Point]]:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from experiments.command_line import Parser, bad_input, run_command
-from experiments.crossings import Crossings, totals
+from experiments.crossings import Crossings, Walls, totals
 from experiments.evaluate import evaluate, interval
 from experiments.gait_search import TASKS, actions, committed, row
 from experiments.plan import Entry, make_plan
@@ -24,7 +24,7 @@ from hippo.core.settings import ConfigError
 from hippo.envs import make
 from hippo.envs.blocks import TUMBLED
 
-Policy = Callable[[int], np.ndarray]  # step -> actions (N, A)
+Policy = Callable[[int, np.ndarray], np.ndarray]  # step, observations (N, D) -> actions (N, A)
 CEILING = {"block_hopper": 7.60, "block_half_cheetah": 16.27}  # walls per episode of the blind gait, as the page says
 HEADER = f"| task | policy | walls per episode | 95 % interval | with \\|pitch\\| > {TUMBLED:g} rad | torso at, m |"
 BLANKED = " of the blind gait's | walls blanked | 95 % interval |"
@@ -32,19 +32,19 @@ BLANKED = " of the blind gait's | walls blanked | 95 % interval |"
 
 def uniform(envs: Any, rng: np.random.Generator) -> Policy:
     """Every action equally likely."""
-    return lambda step: rng.uniform(-1, 1, envs.action_space.shape)
+    return lambda step, obs: rng.uniform(-1, 1, envs.action_space.shape)
 
 
 def noise(envs: Any, rng: np.random.Generator) -> Policy:
     """Standard Gaussian noise, clipped: a policy before its first update."""
-    return lambda step: rng.standard_normal(envs.action_space.shape)
+    return lambda step, obs: rng.standard_normal(envs.action_space.shape)
 
 
 def blind_gait(task: str) -> Callable[[Any, np.random.Generator], Policy]:
     """The gait that was found for `task`."""
     parameters = row(committed(task))[None]
     return lambda envs, rng: (
-        lambda step: np.repeat(actions(parameters, step / envs.metadata["render_fps"]), envs.num_envs, 0)
+        lambda step, obs: np.repeat(actions(parameters, step / envs.metadata["render_fps"]), envs.num_envs, 0)
     )
 
 
@@ -54,15 +54,21 @@ def measure(
     episodes: int,
     seed: int,
     horizon: int | None = None,
+    walls_as: np.ndarray | None = None,
     **options: Any,
-) -> list[dict[str, Any]]:
-    """A row of crossings.COLUMNS for each of so many episodes."""
-    envs = Crossings(make(task, episodes, seeding.integer(seed, "calibration"), horizon=horizon, **options))
+) -> tuple[list[dict[str, Any]], np.ndarray]:
+    """A row of crossings.COLUMNS for each of so many episodes, and the mean of what was observed of walls, (8,).
+
+    Args:
+        walls_as: what the policy observes of walls in place of what they are.
+    """
+    crossed = Crossings(make(task, episodes, seeding.integer(seed, "calibration"), horizon=horizon, **options))
+    envs = Walls(crossed, walls_as)
     act = policy(envs, seeding.numpy_generator(seed, "calibration"))
-    envs.reset()
+    obs, _ = envs.reset()
     for step in range(envs.horizon):
-        envs.step(act(step))
-    return envs.rows()
+        obs, *_ = envs.step(act(step, obs))
+    return crossed.rows(), envs.mean()
 
 
 def line(task: str, name: str, rows: Sequence[dict[str, Any]]) -> str:
@@ -88,13 +94,10 @@ def finished(figure: str, scale: str, protocol: str, runs_dir: Path) -> list[Ent
     return found
 
 
-def trained_line(entry: Entry, episodes: int, seed: int) -> str:
+def trained_line(task: str, name: str, rows: Sequence[dict[str, Any]], blanked: Sequence[dict[str, Any]]) -> str:
     """One row about a trained policy: as the others, its share of the blind gait's walls, and with walls blanked."""
-    run = entry.run
-    rows, blanked = (evaluate(run, episodes, seed, blank_walls=blank) for blank in (False, True))
-    share = np.mean([r["crossings"] for r in rows]) / CEILING[run.env]
-    name = f"{entry.variant_label}, seed {run.seed}"
-    return f"{line(run.env, name, rows)} {share:.0%} | {mean_and_interval(blanked)} |"
+    share = np.mean([r["crossings"] for r in rows]) / CEILING[task]
+    return f"{line(task, name, rows)} {share:.0%} | {mean_and_interval(blanked)} |"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -115,11 +118,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.figure is not None:
         return show_trained(options)
     print(HEADER, "|---|---|---|---|---|---|", sep="\n")
-    changes = {"terminate_on_tumble": True} if options.tumble else {}
+    changes: dict[str, Any] = {"terminate_on_tumble": True} if options.tumble else {}
     for task in [options.task] if options.task else TASKS:
         policies = {"uniform actions": uniform, "Gaussian noise": noise, "blind gait": blind_gait(task)}
         for name, policy in policies.items():
-            print(line(task, name, measure(task, policy, options.episodes, options.seed, **changes)), flush=True)
+            rows, _ = measure(task, policy, options.episodes, options.seed, **changes)
+            print(line(task, name, rows), flush=True)
     return 0
 
 
@@ -131,7 +135,9 @@ def show_trained(options: argparse.Namespace) -> int:
         entries = finished(options.figure, options.scale, options.protocol, options.runs_dir)
         print(HEADER + BLANKED, "|---|---|---|---|---|---|---|---|---|", sep="\n")
         for entry in (e for e in entries if options.task in (None, e.run.env)):
-            print(trained_line(entry, options.episodes, options.seed), flush=True)
+            run, of = entry.run, (options.episodes, options.seed)
+            rows, blanked = (evaluate(run, *of, blank_walls=blank) for blank in (False, True))
+            print(trained_line(run.env, f"{entry.variant_label}, seed {run.seed}", rows, blanked), flush=True)
     except (ConfigError, CheckpointError) as error:
         return bad_input(error)
     return 0

@@ -33,13 +33,13 @@ def frames_of(task: str) -> np.ndarray:
     every = round(APART * envs.metadata["render_fps"])
     shown = [cleared + round((i - (FRAMES - 1) / 2) * every) for i in range(FRAMES)]
     act = blind_gait(task)(envs, seeding.numpy_generator(SEED, "calibration"))
-    envs.reset(seed=SEED)
+    obs, _ = envs.reset(seed=SEED)
     renderer = Renderer(envs, WIDTH, HEIGHT)
     frames = []
     for step in range(shown[-1] + 1):
         if step in shown:
             frames.append(renderer.frame(0))
-        envs.step(act(step))
+        obs, *_ = envs.step(act(step, obs))
     renderer.close()
     return np.concatenate(frames, 1)
 
@@ -48,11 +48,11 @@ def steps_until(task: str, walls: int) -> int:
     """After how many steps the gait of `task` has cleared so many."""
     envs = make(task, 1, SEED)
     act = blind_gait(task)(envs, seeding.numpy_generator(SEED, "calibration"))
-    envs.reset(seed=SEED)
+    obs, _ = envs.reset(seed=SEED)
     paid, step = 0.0, 0
     while paid < walls and step < envs.horizon:
-        paid += float(envs.step(act(step))[1][0])
-        step += 1
+        obs, reward, *_ = envs.step(act(step, obs))
+        paid, step = paid + float(reward[0]), step + 1
     return step
 
 

@@ -5,7 +5,8 @@
 
 A study is a file of conf/study: its `variants`, each times all combinations of `over`, in its environments with its
 seeds. Rows of finished runs are kept in paper_figures/data/studies/<name>.csv, which `run` adds to; `show` writes
-docs/studies/<name>.md and the picture beside it from nothing else.
+docs/studies/<name>.md and the picture beside it from nothing else. With `peer: true` Stable-Baselines3's PPO stands
+beside its variants, with the seeds that experiments.peer_curves has trained.
 """
 
 import argparse
@@ -26,7 +27,7 @@ import yaml
 
 from analysis import stats
 from analysis.runs import COLUMNS, Results, read_committed, read_progress, scores
-from experiments import sweep
+from experiments import peer_curves, sweep
 from experiments.command_line import EXIT_FAILED, EXIT_REQUEUE, Parser, bad_input, clock, run_command
 from experiments.commit import as_csv
 from experiments.config import COMMITTED, CONF, Run, check_choice, choices, compose_run
@@ -54,9 +55,23 @@ class Study:
     description: dict[str, Any]
     entries: list[StudyEntry]
 
+    def peer(self) -> pd.DataFrame:
+        """The rows of Stable-Baselines3's PPO that belong to the study, as its own are."""
+        rows = peer_curves.read(peer_curves.ROWS)
+        rows = rows[rows["env"].isin(self.description["environments"]) & self.description.get("peer", False)]
+        run_ids = "stable_baselines3_seed_" + rows["seed"].astype(str)
+        labels = {"figure": self.name, "scale": self.entries[0].run.scale, "variant": peer_curves.LABEL}
+        return rows.assign(**labels, run_id=run_ids, metric="return_mean", value=rows["return_mean"])[COLUMNS]
+
     def results(self, frame: pd.DataFrame) -> Results:
         """Rows of the study as those of a figure, so that they can be drawn as one."""
         runs = [entry.as_planned() for entry in self.entries]
+        beside = frame[frame["variant"] == peer_curves.LABEL]
+        for (env, seed), rows in beside.groupby(["env", "seed"]):
+            budget = {"iterations": len(rows), "batch_size": round(rows["env_steps"].max() / len(rows))}
+            of_peer = {"run_id": rows["run_id"].iloc[0], "env": env, "seed": seed, "env_label": env_label(str(env))}
+            labels = dict.fromkeys(("variant", "variant_label"), peer_curves.LABEL)
+            runs.append({**runs[0], **of_peer, **labels, **budget})
         first, there = self.entries[0].run, set(frame["run_id"])
         edition = {"scale": first.scale, "protocol": first.protocol}
         plan = {"figure": self.name, "title": self.description["title"], "runs": runs, **edition}
@@ -137,6 +152,8 @@ def table(study: Study, frame: pd.DataFrame) -> list[str]:
     """
     environments = list(study.description["environments"])
     labels = dict.fromkeys((e.group, e.variant) for e in study.entries)
+    if study.description.get("peer"):
+        labels[peer_curves.LABEL, peer_curves.LABEL] = None
     finals, areas, counts = {}, {}, {}
     for (_, label), env in itertools.product(labels, environments):
         seeds, _, columns = scores(frame, env, label)
@@ -188,8 +205,9 @@ def page(study: Study, frame: pd.DataFrame, picture: str) -> str:
 
 def show(study: Study, rows: Path, pages: Path) -> int:
     """Print the table; write the page and the picture."""
-    frame = read_committed(rows / f"{study.name}.csv", study.entries[0].run.scale)
-    if frame.empty:
+    own = read_committed(rows / f"{study.name}.csv", study.entries[0].run.scale)
+    frame = pd.concat([own, *([peer] if len(peer := study.peer()) else [])], ignore_index=True)
+    if own.empty:
         print(f"{study.name}: no rows yet; `python -m experiments.study run {study.name}` makes them", file=sys.stderr)
         return EXIT_FAILED
     pages.mkdir(parents=True, exist_ok=True)
