@@ -23,6 +23,7 @@ from hippo.core.checkpoint import Checkpoint
 from hippo.core.log import RunLog
 from hippo.core.networks import mlp
 from hippo.core.normalize import Standardizer
+from hippo.core.optimizers import Adam
 from hippo.core.policies import SkillPolicy
 from hippo.core.ppo import in_chunks
 from hippo.core.pretraining import Paths, PretrainingConfig, train_skills, trained_skills
@@ -116,7 +117,7 @@ class Distinguishable:
         generator = seeding.torch_generator(seed, "discriminator")
         self.discriminator = Discriminator(names, config.num_skills, config.discriminator_hidden_sizes, generator)
         rate = config.discriminator_learning_rate
-        self.optimizer = torch.optim.Adam(self.discriminator.parameters(), lr=rate)
+        self.optimizer = Adam(self.discriminator.parameters(), lr=rate)
         self.parts: dict[str, Any] = {
             "discriminator": self.discriminator,
             "discriminator_optimizer": self.optimizer,

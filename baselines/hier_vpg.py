@@ -30,6 +30,7 @@ from hippo.core.hierarchy import (
     restored,
 )
 from hippo.core.log import RunLog, check_finite
+from hippo.core.optimizers import Adam
 from hippo.core.ppo import Level, chunks
 from hippo.core.settings import setting
 from hippo.core.skills import start_from
@@ -75,7 +76,7 @@ def train(config: HierVPGConfig, make_envs: MakeEnvs, log: RunLog, seed: int, ch
     policy = HierarchicalPolicy(config, obs_size, envs.robot_size, action_size, generator)
     start_from(config.skills, policy.skills, envs)
     baselines = Baselines(config, obs_size, generator)
-    optimizer = torch.optim.Adam(policy.parameters(), lr=config.learning_rate)
+    optimizer = Adam(policy.parameters(), lr=config.learning_rate)
 
     parts = {"policy": policy, "baselines": baselines, "optimizer": optimizer}
     first = checkpoint.restore(**parts)

@@ -28,6 +28,7 @@ from hippo.core import seeding
 from hippo.core.checkpoint import Checkpoint
 from hippo.core.goals import BODY_GOALS, GOAL_SPACES, Goals, Memory, candidate_goals
 from hippo.core.log import RunLog, check_finite
+from hippo.core.optimizers import Adam
 from hippo.core.replay import Replay
 from hippo.core.rollout import LastInfo, Steps
 from hippo.core.settings import MOST_STEPS, WIDEST, ConfigError, check, setting
@@ -379,7 +380,7 @@ def skill_rollouts(config: HiroConfig, agents: Agents, memory: Memory, envs: Any
 def clone(config: HiroConfig, agents: Agents, replay: Replay, seed: int) -> None:
     """Behaviour cloning: fit the lower level to the actions in `replay`, given its states and goals."""
     generator, actor = seeding.torch_generator(seed, "cloning"), agents.low.actor
-    optimizer = torch.optim.Adam(actor.parameters(), lr=CLONING_LEARNING_RATE, fused=True)
+    optimizer = Adam(actor.parameters(), lr=CLONING_LEARNING_RATE, fused=True)
     for _ in range(config.cloning_updates):
         rows = replay.sample(config.minibatch_size, generator)
         loss = (actor(agents.low_input(rows["obs"], rows["goal"])) - rows["action"]).square().mean()

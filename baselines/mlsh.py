@@ -32,6 +32,7 @@ from hippo.core.hierarchy import (
 )
 from hippo.core.log import RunLog, check_finite
 from hippo.core.minibatch import maximize_in_minibatches
+from hippo.core.optimizers import Adam
 from hippo.core.policies import Manager
 from hippo.core.ppo import Level
 from hippo.core.settings import ConfigError, setting
@@ -239,8 +240,8 @@ def train(config: MLSHConfig, make_envs: MakeEnvs, log: RunLog, seed: int, check
     start_from(config.skills, policy.skills, envs)
     baselines = Baselines(config, obs_size, generator)
     optimizers: dict[str, torch.optim.Optimizer] = {
-        "manager": torch.optim.Adam(policy.manager.parameters(), lr=config.manager_learning_rate, fused=True),
-        "skill": torch.optim.Adam(policy.skills.parameters(), lr=config.skill_learning_rate, fused=True),
+        "manager": Adam(policy.manager.parameters(), lr=config.manager_learning_rate, fused=True),
+        "skill": Adam(policy.skills.parameters(), lr=config.skill_learning_rate, fused=True),
     }
     parts = {
         "policy": policy,

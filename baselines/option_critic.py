@@ -21,6 +21,7 @@ from hippo.core.log import RunLog, check_finite
 from hippo.core.minibatch import maximize_in_minibatches, minibatches
 from hippo.core.networks import normalize_columns
 from hippo.core.normalize import standardize
+from hippo.core.optimizers import Adam
 from hippo.core.options import Acting, Execution, OptionPolicy, Options
 from hippo.core.policies import POLICY_HEAD, gaussian_entropy
 from hippo.core.ppo import Level, Rows, clipped_surrogate, in_chunks, surrogate_statistics
@@ -473,7 +474,7 @@ def make_optimizers(config: OptionCriticConfig, policy: OptionPolicy) -> dict[st
     if config.ppoc_faithful:
         networks, rates = {"all": policy}, {"all": config.learning_rate}
     return {
-        name: torch.optim.Adam(network.parameters(), lr=rates[name], eps=config.adam_epsilon, fused=True)
+        name: Adam(network.parameters(), lr=rates[name], eps=config.adam_epsilon, fused=True)
         for name, network in networks.items()
     }
 

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy import stats
+from scipy import special
 
 from experiments import crossings
 from experiments.command_line import Parser, bad_input, check_writable, run_command
@@ -215,7 +215,7 @@ def summary(rows: Sequence[dict[str, Any]]) -> str:
 def interval(returns: np.ndarray) -> tuple[float, float]:
     """Student's 95 % interval of the mean of (n,) returns; of equal ones, and of a single one, a point."""
     mean, error = returns.mean(), returns.std(ddof=1) / len(returns) ** 0.5 if len(returns) > 1 else 0.0
-    half = error * stats.t.ppf(0.975, len(returns) - 1) if error else 0.0
+    half = error * special.stdtrit(len(returns) - 1, 0.975) if error else 0.0
     return mean - half, mean + half
 
 

@@ -58,7 +58,7 @@ def runs(tmp_path_factory):
             plan.make_plan("fig3", SCALE, settings, True, folder / "runs", protocol).write(folder / "runs")
     config._base.cache_clear()
     torch.set_num_threads(threads)
-    torch.use_deterministic_algorithms(False)
+    torch.set_deterministic_debug_mode("default")
     return folder / "runs"
 
 

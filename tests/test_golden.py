@@ -87,12 +87,12 @@ def test_nothing_is_read_before_it_is_written(name, monkeypatch):
     """Training does without it (experiments/train.py): torch's deterministic mode fills fresh memory with NaN."""
     plain = metrics(name)
     monkeypatch.setattr(torch.utils.deterministic, "fill_uninitialized_memory", True)
-    torch.use_deterministic_algorithms(True)
+    torch.set_deterministic_debug_mode("error")
     try:
         assert torch.empty(1000).isnan().all()
         filled = metrics.__wrapped__(name)
     finally:
-        torch.use_deterministic_algorithms(False)
+        torch.set_deterministic_debug_mode("default")
     assert filled == plain
 
 

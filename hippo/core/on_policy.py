@@ -17,6 +17,7 @@ from hippo.core import seeding
 from hippo.core.direct import SquaredError
 from hippo.core.minibatch import minibatches
 from hippo.core.normalize import ObservationFilter
+from hippo.core.optimizers import Adam
 from hippo.core.ppo import Level, in_chunks, maximize
 from hippo.core.settings import MOST_STEPS, WIDEST, ConfigError, check, setting
 
@@ -126,11 +127,11 @@ class SurrogateConfig(OnPolicyConfig):
         return self.value_loss_weight > 0
 
 
-def make_optimizer(config: SurrogateConfig, parameters: Iterable[nn.Parameter]) -> torch.optim.Adam:
+def make_optimizer(config: SurrogateConfig, parameters: Iterable[nn.Parameter]) -> Adam:
     """Adam as `improve` uses it."""
     if config.minibatch_size:
-        return torch.optim.Adam(parameters, lr=config.learning_rate, eps=ADAM_EPSILON, fused=True)
-    return torch.optim.Adam(parameters, lr=config.learning_rate)
+        return Adam(parameters, lr=config.learning_rate, eps=ADAM_EPSILON, fused=True)
+    return Adam(parameters, lr=config.learning_rate)
 
 
 def improve(

@@ -18,6 +18,7 @@ from hippo.core.checkpoint import Checkpoint
 from hippo.core.gae import gae
 from hippo.core.log import RunLog, check_finite
 from hippo.core.normalize import standardize
+from hippo.core.optimizers import Adam
 from hippo.core.policies import SkillPolicy, gaussian_entropy
 from hippo.core.ppo import Level, Rows, maximize
 from hippo.core.rollout import LastInfo, Steps
@@ -159,7 +160,7 @@ def train_skills(
     generator = seeding.torch_generator(seed, "initialisation")
     policy = new_policy(config, envs, generator)
     baseline = ValueFunction(policy.first.inputs, config.value_hidden_sizes, generator, config.num_skills)
-    optimizer = torch.optim.Adam(policy.parameters(), lr=config.learning_rate)
+    optimizer = Adam(policy.parameters(), lr=config.learning_rate)
     parts = {"policy": policy, "baseline": baseline, "optimizer": optimizer} | objective.parts
     first = checkpoint.restore(**parts)
     log.resume(first)

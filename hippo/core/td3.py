@@ -12,6 +12,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import smooth_l1_loss
 
+from hippo.core.optimizers import Adam
+
 
 def _uniform(shape: tuple[int, ...], bound: float, generator: torch.Generator) -> nn.Parameter:
     return nn.Parameter((2 * torch.rand(shape, generator=generator) - 1) * bound)
@@ -107,8 +109,8 @@ class TD3(nn.Module):
         self.register_buffer("updates", torch.tensor(0))
         self.gamma, self.tau, self.delay = gamma, tau, delay
         self.target_noise, self.target_noise_clip = target_noise, target_noise_clip
-        self.actor_optimizer = torch.optim.Adam(self.actor.parameters(), lr=actor_learning_rate, fused=True)
-        self.critic_optimizer = torch.optim.Adam(self.critics.parameters(), lr=critic_learning_rate, fused=True)
+        self.actor_optimizer = Adam(self.actor.parameters(), lr=actor_learning_rate, fused=True)
+        self.critic_optimizer = Adam(self.critics.parameters(), lr=critic_learning_rate, fused=True)
 
     @torch.no_grad()
     def target(self, reward: Tensor, next_x: Tensor, continues: Tensor, generator: torch.Generator) -> Tensor:

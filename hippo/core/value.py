@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 from hippo.core.networks import SkillLinear, grouped_layers, linear, mlp, normalize_columns
 from hippo.core.normalize import Standardizer
+from hippo.core.optimizers import LBFGS
 from hippo.core.ppo import chunks, in_chunks
 
 
@@ -131,7 +132,7 @@ class ValueFunction(nn.Module):
                     kept.copy_(p.detach())
             return total
 
-        optimizer = torch.optim.LBFGS(
+        optimizer = LBFGS(
             parameters, max_iter=evaluations, max_eval=evaluations, history_size=10, line_search_fn="strong_wolfe"
         )
         with contextlib.suppress(_BudgetSpent):
