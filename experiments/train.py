@@ -191,7 +191,7 @@ def _preemption(status: Status) -> Iterator[None]:
 def prepare(run: Run) -> Callable[[int, str], Any]:
     """Set torch up and return what makes the run's environments, each purpose with its own random stream."""
     torch.set_num_threads(1)
-    # Of two functions that refuse what is not deterministic, the one that does not import the compiler: 2.5 s of CPU.
+    # Of two functions that refuse what is not deterministic, the one that does not import the compiler.
     torch.set_deterministic_debug_mode("error")
     # Filling fresh memory would be in vain: nothing is read before it is written (tests/test_golden.py sees to it).
     torch.utils.deterministic.fill_uninitialized_memory = False  # type: ignore[attr-defined]

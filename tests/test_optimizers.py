@@ -8,7 +8,7 @@ import torch
 
 from hippo.core import optimizers
 
-# Each costs a process that trains a second of CPU or more and is of no use to it.
+# Each takes time to import and is of no use to a process that trains.
 IDLE = ("torch._dynamo", "torch._inductor", "sympy", "scipy.stats")
 
 

@@ -1,4 +1,4 @@
-"""Torch's optimizers without its compiler, which they import on first use: 2.5 s of CPU in every process that trains.
+"""Torch's optimizers without its compiler, which they import on first use: half a second in every process that trains.
 
 What they compute is theirs to the bit; the methods are those under the decorators that talk to the compiler.
 """
