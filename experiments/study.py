@@ -38,6 +38,7 @@ from paper_figures import curves, style
 
 ROWS, PAGES = COMMITTED / "studies", Path(__file__).parent.parent / "docs" / "studies"
 REPORT_SECONDS = 30.0  # between two progress lines
+WITHIN = 1.01  # of a study's budget, to which the peer's iterations do not add up exactly
 
 
 @dataclass
@@ -56,9 +57,10 @@ class Study:
     entries: list[StudyEntry]
 
     def peer(self) -> pd.DataFrame:
-        """The rows of Stable-Baselines3's PPO that belong to the study, as its own are."""
+        """The rows of Stable-Baselines3's PPO that belong to the study, up to its budget, as its own are."""
         rows = peer_curves.read(peer_curves.ROWS)
-        rows = rows[rows["env"].isin(self.description["environments"]) & self.description.get("peer", False)]
+        budgets = {entry.run.env: entry.run.env_steps for entry in self.entries if self.description.get("peer")}
+        rows = rows[rows["env_steps"] <= WITHIN * rows["env"].map(budgets).fillna(0)]
         run_ids = "stable_baselines3_seed_" + rows["seed"].astype(str)
         labels = {"figure": self.name, "scale": self.entries[0].run.scale, "variant": peer_curves.LABEL}
         return rows.assign(**labels, run_id=run_ids, metric="return_mean", value=rows["return_mean"])[COLUMNS]

@@ -49,7 +49,7 @@ def test_a_study_has_it_beside_its_variants(tmp_path, trained, monkeypatch):
     described = {
         "title": "A task",
         "text": "Why.",
-        "settings": ["scale=smoke", "iterations=2"],
+        "settings": ["scale=smoke", "iterations=3", "batch_size=8000"],
         "environments": {"gym:Pendulum-v1": []},
         "variants": {"PPO": ["algo=ppo"]},
         "peer": True,
@@ -60,6 +60,7 @@ def test_a_study_has_it_beside_its_variants(tmp_path, trained, monkeypatch):
     lines = study.table(made, made.peer())
     assert lines[-1].startswith("| PPO, Stable-Baselines3 | 3 | 1.00 ± 1.00 | 1.00 ± 1.00 |")
     assert "block_hopper" not in "".join(lines)
+    assert made.peer()["env_steps"].max() == 16384  # 24000 of the study's, and one iteration more is beyond them
     drawn = made.results(made.peer())
     assert {run["variant"]: run["batch_size"] for run in drawn.plan["runs"]} == {
         "PPO": made.entries[0].run.config.batch_size,
