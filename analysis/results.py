@@ -9,6 +9,7 @@ import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -82,17 +83,25 @@ def section(results: Results) -> list[str]:
 
 
 def untrained(results: Results) -> list[str]:
-    """What is missing, an entry per environment."""
-    planned: dict[str, set[str]] = {}
-    for run in results.missing:
-        planned.setdefault(run["env_label"], set()).add(run["variant_label"])
-    everything = {run["env_label"]: set[str]() for run in results.plan["runs"]}
-    for run in results.plan["runs"]:
-        everything[run["env_label"]].add(run["variant_label"])
-    return [
-        f"{env}: {'all' if variants == everything[env] else ', '.join(sorted(variants))}"
-        for env, variants in planned.items()
-    ]
+    """What is missing, an entry per environment and set of seeds: methods, or `all`, and which seeds if not all."""
+    planned, missing = (seeds_of(runs) for runs in (results.plan["runs"], results.missing))
+    entries = []
+    for env, variants in missing.items():
+        alike: dict[str, list[str]] = {}
+        for variant, seeds in variants.items():
+            which = "" if seeds == planned[env][variant] else f", seed {', '.join(map(str, sorted(seeds)))}"
+            alike.setdefault(which, []).append(variant)
+        for which, names in alike.items():
+            entries.append(f"{env}: {'all' if len(names) == len(planned[env]) else ', '.join(sorted(names))}{which}")
+    return entries
+
+
+def seeds_of(runs: Sequence[dict[str, Any]]) -> dict[str, dict[str, set[int]]]:
+    """Environment -> method -> seeds of planned runs."""
+    found: dict[str, dict[str, set[int]]] = {}
+    for run in runs:
+        found.setdefault(run["env_label"], {}).setdefault(run["variant_label"], set()).add(run["seed"])
+    return found
 
 
 def table_section(results: Results) -> list[str]:

@@ -70,3 +70,17 @@ def test_every_test_that_the_page_on_failures_names_exists():
     assert len(named) > 20
     missing = [name for path, name in named if f"def {name}(" not in (ROOT / path).read_text()]
     assert not missing
+
+
+def test_findings_quote_numbers_that_other_pages_have():
+    def decimals(text):
+        return set(re.findall(r"(?<![\w.])\d+\.\d+", text))
+
+    docs = ROOT / "docs"
+    pages = ["results.md", "reproduce.md", "modern.md", "environments/calibration.md", *docs.glob("studies/*.md")]
+    there = set().union(*(decimals((docs / page).read_text()) for page in pages))
+    there |= {f"{float(number):.{digits}f}" for number in there for digits in range(1, len(number.split(".")[1]))}
+    sections = re.split(r"^## ", (docs / "findings.md").read_text(), flags=re.MULTILINE)
+    quoted = {title: decimals(text) - there for title, text in (s.split("\n", 1) for s in sections if "(Figure 3" in s)}
+    assert len(quoted) == 2
+    assert not any(quoted.values()), quoted

@@ -9,7 +9,7 @@ import pytest
 from analysis import claims, results
 from analysis.command_line import PROTOCOLS
 from analysis.edition import Edition
-from analysis.runs import COLUMNS
+from analysis.runs import COLUMNS, Results
 from experiments.plan import make_plan
 from tests.test_analysis import planned
 
@@ -48,6 +48,20 @@ def test_final_and_area_by_hand(tmp_path):
     everything = len(claims.CLAIMS)
     assert f"{everything} claims: 0 reproduced, 1 not reproduced, {everything - 1} undecided." in page
     assert len([line for line in summary.splitlines() if line.startswith("| ")]) == 2  # the head, and that one
+
+
+def test_what_is_not_trained_names_methods_and_of_those_begun_the_seeds():
+    def run(env, variant, seed):
+        return {"env_label": env, "variant_label": variant, "seed": seed}
+
+    planned = [run(env, variant, seed) for env in "AB" for variant in ("PPO", "HiPPO") for seed in range(3)]
+    missing = [r for r in planned if r["env_label"] == "A" and r["seed"] > 0]
+    missing += [run("B", "PPO", 2), *(run("B", "HiPPO", seed) for seed in range(3))]
+    assert results.untrained(Results({"runs": planned}, pd.DataFrame(), missing)) == [
+        "A: all, seed 1, 2",
+        "B: PPO, seed 2",
+        "B: HiPPO",
+    ]
 
 
 def test_without_committed_rows_it_says_so(tmp_path):
