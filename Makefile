@@ -98,8 +98,13 @@ lint: install  ## ruff (format and rules) and mypy
 
 FAST_TESTS = -m "not slow and not slurm and not browser" --numprocesses logical --maxprocesses 4 --dist loadfile
 
-test: install  ## every test but the slow ones
-	$(PY) pytest $(FAST_TESTS)
+# Of those in folders of their own; tests/slurm and tests/report have targets below.
+TEST_GROUPS := $(filter-out slurm report,$(patsubst tests/%/__init__.py,%,$(wildcard tests/*/__init__.py)))
+not_a_group = $(filter-out $(TEST_GROUPS),$(value ONLY))
+
+test: install  ## every test but the slow ones; ONLY=envs or ONLY="hippo baselines" runs groups of tests/
+	$(if $(not_a_group),$(error ONLY=$(not_a_group) is no group of tests; choose from: $(TEST_GROUPS)))
+	$(PY) pytest $(FAST_TESTS) $(ONLY:%=tests/%)
 
 coverage: install  ## the lines of each package, in per cent, that `make test` runs, in processes of their own too
 	$(PY) pytest $(FAST_TESTS) --cov --cov-report=term

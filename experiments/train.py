@@ -193,7 +193,7 @@ def prepare(run: Run) -> Callable[[int, str], Any]:
     torch.set_num_threads(1)
     # Of two functions that refuse what is not deterministic, the one that does not import the compiler.
     torch.set_deterministic_debug_mode("error")
-    # Filling fresh memory would be in vain: nothing is read before it is written (tests/test_golden.py sees to it).
+    # Filling fresh memory would be in vain: nothing is read before it is written (tests/hippo/test_golden.py).
     torch.utils.deterministic.fill_uninitialized_memory = False  # type: ignore[attr-defined]
 
     def make_envs(num_envs: int, purpose: str) -> Any:
