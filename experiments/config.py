@@ -32,8 +32,9 @@ from hippo.envs.foreign import ForeignOptions
 from hippo.envs.registration import Options, check_options
 from hippo.learners import LEARNERS, config_class, learner_of
 
-CONF = Path(__file__).parent / "conf"
-COMMITTED = Path(__file__).parent.parent / "paper_figures" / "data"
+ROOT = Path(__file__).parent.parent
+CONF = ROOT / "experiments" / "conf"
+COMMITTED = ROOT / "paper_figures" / "data"
 # The groups of conf/ that a run chooses from, and what it chooses when nothing is said.
 GROUPS = {"env": "block_hopper", "algo": "hippo", "scale": "paper", "protocol": "paper"}
 BUDGET_FIELDS = ("iterations", "batch_size", "horizon")

@@ -26,8 +26,8 @@ import submitit
 
 from experiments import costs
 from experiments.command_line import duration
-from experiments.config import Run
-from experiments.manifest import ROOT, code_version, git
+from experiments.config import ROOT, Run
+from experiments.manifest import code_version, git
 from experiments.slurm_profile import Profile
 from experiments.status import ABANDONED_SECONDS, locked, read_status, remove_abandoned, write_atomically
 from experiments.train import execute

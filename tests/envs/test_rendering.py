@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 import hippo.envs
-from experiments import environment_pages, fidelity, train, video
+from experiments import train, video
+from experiments.artefacts import environment_pages, fidelity
 from experiments.config import compose_run
 from hippo.envs import make
 from hippo.envs.rendering import NoOpenGL, Renderer, follow, open_gl
@@ -273,7 +274,7 @@ def test_fidelity_refuses_a_run_of_a_task_with_one_kind_of_physics(tmp_path, cap
 
 @pytest.mark.parametrize("page", sorted(environment_pages.FOLDER.glob("*.md")), ids=lambda path: path.stem)
 def test_the_tables_of_the_environment_pages_are_fresh(page):
-    assert environment_pages.renewed(page) == page.read_text(), "run python -m experiments.environment_pages"
+    assert environment_pages.renewed(page) == page.read_text(), "run python -m experiments.artefacts.environment_pages"
 
 
 def test_every_environment_has_a_page_and_every_option_is_on_it():

@@ -4,12 +4,13 @@ import itertools
 
 import pytest
 
-from experiments import bench, bench_targets
-from experiments.bench_flame import labelled
-from experiments.bench_iterations import Iteration, parts
-from experiments.bench_learning import Point, seconds_to, totals, walls_at
-from experiments.bench_measure import Row, beside, contestants, median_ratio, median_reference, median_speed
-from experiments.bench_targets import Target, closing, with_block
+from experiments.bench import __main__ as bench
+from experiments.bench import targets
+from experiments.bench.flame import labelled
+from experiments.bench.iterations import Iteration, parts
+from experiments.bench.learning import Point, seconds_to, totals, walls_at
+from experiments.bench.measure import Row, beside, contestants, median_ratio, median_reference, median_speed
+from experiments.bench.targets import Target, closing, with_block
 
 
 class Machine:
@@ -108,14 +109,14 @@ def test_a_target_is_met_at_its_bound_in_both_directions():
 
 
 def test_the_closing_table_says_met_missed_and_not_measured(monkeypatch):
-    targets = {
+    aims = {
         "fast": Target("fast enough", ">=", 4),
         "slow": Target("too slow", ">=", 4),
         "small": Target("small enough", "<=", 1000),
         "large": Target("too large", "<=", 1000),
         "absent": Target("not looked at", "<=", 3),
     }
-    monkeypatch.setattr(bench_targets, "TARGETS", targets)
+    monkeypatch.setattr(targets, "TARGETS", aims)
     _, *rows = closing({"fast": 4.5, "slow": 2.4, "small": 495, "large": 1030})
     assert [(row.split(">=")[0].split("<=")[0].strip(), row.split()[-1]) for row in rows] == [
         ("fast enough", "met"),
@@ -142,7 +143,7 @@ def test_only_what_is_between_the_marks_is_replaced():
 
 
 def test_the_page_has_its_marks():
-    with_block(bench_targets.PAGE.read_text(), "", [])
+    with_block(targets.PAGE.read_text(), "", [])
 
 
 @pytest.fixture
@@ -160,7 +161,7 @@ def short(monkeypatch, tmp_path):
     page = tmp_path / "performance.md"
     page.write_text(PAGE)
     monkeypatch.setattr(bench, "PARTS", {"memory": bench.Part(rows, 60, 6), "peers": bench.Part(rows, 60, 6)})
-    monkeypatch.setattr(bench_targets, "PAGE", page)
+    monkeypatch.setattr(targets, "PAGE", page)
     return page, lambda: bench.PARTS.update(peers=bench.Part(broken, 60, 6))
 
 
@@ -187,7 +188,7 @@ def test_chosen_parts_are_shown_with_progress_and_nothing_is_written(short, caps
 
 def test_write_puts_the_whole_table_between_the_marks(short, monkeypatch):
     page, _ = short
-    monkeypatch.setattr(bench_targets, "machine", lambda: "A machine.")
+    monkeypatch.setattr(targets, "machine", lambda: "A machine.")
     assert bench.main(["--write"]) == 0
     text = page.read_text()
     head, tail = PAGE.split("old\n")

@@ -8,13 +8,15 @@ import mujoco
 import numpy as np
 import pytest
 
-from experiments import calibration, crossings, gait_picture, gait_search
+from experiments import crossings
+from experiments.artefacts import calibration, gait_picture, gait_search
 from experiments.config import compose_run
 from experiments.crossings import Crossings
 from experiments.plan import Entry
 from hippo.envs import make
+from tests import ROOT
 
-CALIBRATION = gait_search.FOUND.parent.parent / "docs/environments/calibration.md"
+CALIBRATION = ROOT / "docs/environments/calibration.md"
 
 
 def put(envs, x, pitch):
@@ -110,7 +112,7 @@ def test_a_strip_shows_the_gait_around_the_clearing_of_a_wall(monkeypatch):
 @pytest.mark.parametrize("task", gait_search.TASKS)
 def test_the_ceiling_is_what_the_page_says_of_the_blind_gait(task):
     written = re.search(rf"\| `{task}` \| blind gait \| ([0-9.]+) ", CALIBRATION.read_text())
-    assert calibration.CEILING[task] == float(written[1])
+    assert crossings.CEILING[task] == float(written[1])
 
 
 def test_a_figure_s_finished_runs_have_a_row_each_with_walls_and_without(tmp_path, monkeypatch, capsys):

@@ -7,7 +7,8 @@ import subprocess
 
 import pytest
 
-from experiments import cost_table, costs, sweep
+from experiments import costs, sweep
+from experiments.artefacts import cost_table
 from experiments.command_line import EXIT_NOT_AGREED
 from experiments.plan import make_plan, trained_at
 from tests import ROOT
@@ -86,7 +87,9 @@ def test_the_scales_of_a_figure_are_those_that_leave_an_environment(plans):
 @pytest.mark.slow  # every plan takes a quarter of a minute
 def test_every_planned_run_has_a_committed_cost(plans):
     kinds = {costs.kind(run) for plan in plans.values() for run in plan.runs()}
-    assert kinds == set(costs.reference()["seconds_per_step"]), "run `python -m experiments.cost_table --measure`"
+    assert kinds == set(costs.reference()["seconds_per_step"]), (
+        "run `python -m experiments.artefacts.cost_table --measure`"
+    )
 
 
 @pytest.mark.slow  # every plan takes a quarter of a minute
@@ -94,7 +97,7 @@ def test_the_readmes_costs_are_those_that_decide(plans):
     written = cost_table.MARK.search(cost_table.README.read_text())
     assert written is not None
     assert written[0] == f"{written[1]}{cost_table.table(plans)}\n{written[2]}", (
-        "run `python -m experiments.cost_table`"
+        "run `python -m experiments.artefacts.cost_table`"
     )
 
 

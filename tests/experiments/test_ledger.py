@@ -4,7 +4,7 @@ import re
 
 import pytest
 
-from experiments import ledger
+from experiments.artefacts import ledger
 from tests.hippo.test_training import LEARNERS, learner
 from tests.hippo.toy import run
 
@@ -17,7 +17,7 @@ def test_every_setting_has_a_meaning_and_a_source():
 
 def test_the_committed_ledger_is_fresh():
     for name, content in (("hyperparameters.csv", ledger.as_csv()), ("hyperparameters.md", ledger.as_markdown())):
-        assert (ledger.DOCS / name).read_text() == content, "run `python -m experiments.ledger`"
+        assert (ledger.DOCS / name).read_text() == content, "run `python -m experiments.artefacts.ledger`"
 
 
 def test_the_papers_appendix_a_is_in_it():

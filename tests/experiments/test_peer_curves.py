@@ -3,8 +3,9 @@
 import pandas as pd
 import pytest
 
-from experiments import calibration, peer_curves, study
-from experiments.bench_learning import Point
+from experiments import peer_rows, study
+from experiments.artefacts import calibration, peer_curves
+from experiments.bench.learning import Point
 
 
 @pytest.fixture
@@ -43,7 +44,7 @@ def test_what_is_kept_is_not_trained_again(tmp_path, trained, capsys):
 
 def test_a_study_has_it_beside_its_variants(tmp_path, trained, monkeypatch):
     path = tmp_path / "rows.csv"
-    monkeypatch.setattr(peer_curves, "ROWS", path)
+    monkeypatch.setattr(peer_rows, "ROWS", path)
     arguments = ["--rows", str(path), "--budget", "20000", "--seeds", "3"]
     assert peer_curves.main([*arguments, "--env", "gym:Pendulum-v1", "--env", "block_hopper"]) == 0
     described = {

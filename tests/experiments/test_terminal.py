@@ -53,7 +53,7 @@ def test_a_command_whose_reader_has_gone_ends_quietly(command):
 
 
 def test_every_command_of_experiments_ends_as_all_others():
-    commands = [path for path in (ROOT / "experiments").glob("*.py") if "__main__" in path.read_text()]
+    commands = [path for path in (ROOT / "experiments").rglob("*.py") if "__main__" in path.read_text()]
     assert len(commands) > 10
     assert [path.name for path in commands if "    run_command(main)\n" not in path.read_text()] == []
 

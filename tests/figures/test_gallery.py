@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 import torch
 
-from experiments import gallery
+from experiments.artefacts import gallery
 from hippo.core.policies import SkillPolicy
 from hippo.core.skills import save_skills
 from hippo.envs import make

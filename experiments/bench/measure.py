@@ -36,7 +36,7 @@ class Row:
     unit: str
     ratio: float | None = None
     of: str = ""  # what the ratio is to
-    key: str = ""  # in bench_targets.TARGETS
+    key: str = ""  # in targets.TARGETS
 
     @property
     def value(self) -> float:

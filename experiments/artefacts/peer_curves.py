@@ -1,7 +1,7 @@
 """Stable-Baselines3's PPO to stand beside ours: its learning curves on the Block tasks or any gym:<id>, seed by seed.
 
-    python -m experiments.peer_curves --seeds 10    trains what is missing, 1 M environment steps each (5 minutes)
-    python -m experiments.peer_curves --seeds 3 --env gym:Hopper-v5 --env gym:HalfCheetah-v5
+    python -m experiments.artefacts.peer_curves --seeds 10   trains what is missing, 1 M steps each (5 minutes)
+    python -m experiments.artefacts.peer_curves --seeds 3 --env gym:Hopper-v5 --env gym:HalfCheetah-v5
 
 It is the learner of `make bench ONLY=learning`: 8 environments x 1024 steps, VecNormalize, otherwise its defaults. Its
 runs are not resumable within a seed, and no run of ours depends on them. On the Block tasks a row of
@@ -17,18 +17,15 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from experiments.bench_learning import BUDGET, GOALS, Point, peer, train_peer
-from experiments.calibration import Policy, measure, trained_line
+from experiments.artefacts.calibration import Policy, measure, trained_line
+from experiments.bench.learning import BUDGET, GOALS, Point, peer, train_peer
 from experiments.command_line import Parser, bad_input, run_command
 from experiments.commit import as_csv
-from experiments.config import COMMITTED
+from experiments.peer_rows import COLUMNS, LABEL, ROWS, read
 from experiments.status import write_atomically
 from hippo.core.settings import ConfigError
 from hippo.envs.registration import environment
 
-ROWS = COMMITTED / "studies" / "stable_baselines3.csv"
-COLUMNS = ["env", "seed", "env_steps", "seconds", "return_mean"]
-LABEL = "PPO, Stable-Baselines3"
 EPISODES = 100
 
 
@@ -64,14 +61,11 @@ def calibrated(learner: Any, env: str, seed: int) -> str:
     return trained_line(env, f"{LABEL}, seed {seed}", rows, blanked)
 
 
-def read(path: Path) -> pd.DataFrame:
-    """The kept rows, none where there is no file."""
-    return pd.read_csv(path) if path.exists() else pd.DataFrame(columns=COLUMNS)
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Train the seeds that are missing, seed by seed in every task."""
-    parser = Parser(prog="experiments.peer_curves", description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = Parser(
+        prog="experiments.artefacts.peer_curves", description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
     parser.add_argument("--seeds", type=int, default=10, help="0, 1, ... below this number")
     parser.add_argument("--env", action="append", help="a task; again for another (the Block tasks)")
     parser.add_argument("--budget", type=int, default=BUDGET, help="environment steps per seed")

@@ -1,7 +1,7 @@
 """What every figure and table costs: the committed seconds per step, and the README's table that follows from them.
 
-python -m experiments.cost_table              # renews README.md between its marks from reference_costs.json
-python -m experiments.cost_table --measure    # first renews reference_costs.json on this machine
+python -m experiments.artefacts.cost_table              # renews README.md between its marks from reference_costs.json
+python -m experiments.artefacts.cost_table --measure    # first renews reference_costs.json on this machine
 """
 
 import json
@@ -11,11 +11,11 @@ from pathlib import Path
 
 from experiments import costs
 from experiments.command_line import Parser, duration, run_command
-from experiments.config import Run, choices
+from experiments.config import ROOT, Run, choices
 from experiments.plan import Plan, make_plan, unique
 from experiments.status import write_atomically
 
-README = Path(__file__).parent.parent / "README.md"
+README = ROOT / "README.md"
 SCALES = ("smoke", "laptop", "paper")
 MARK = re.compile(r"(<!-- costs -->\n).*?(<!-- end -->)", re.DOTALL)
 
@@ -71,7 +71,7 @@ def measure(plans: dict[tuple[str, str], Plan]) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Renew the README, and the costs behind it if asked to."""
-    parser = Parser(prog="experiments.cost_table", description=__doc__.splitlines()[0])
+    parser = Parser(prog="experiments.artefacts.cost_table", description=__doc__.splitlines()[0])
     parser.add_argument("--measure", action="store_true", help="first renew reference_costs.json on this machine")
     options, plans = parser.parse_args(arguments), all_plans()
     if options.measure:

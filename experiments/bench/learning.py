@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from experiments.bench_environments import registered
-from experiments.bench_measure import Row, contestants, one_core
-from experiments.calibration import CEILING
+from experiments.bench.environments import registered
+from experiments.bench.measure import Row, contestants, one_core
 from experiments.config import compose_run
+from experiments.crossings import CEILING
 from experiments.train import prepare
 from hippo.core.checkpoint import Checkpoint
 from hippo.core.log import Row as LogRow

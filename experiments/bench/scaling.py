@@ -3,8 +3,8 @@
 import statistics
 from collections.abc import Iterator
 
-from experiments.bench_iterations import Iteration, training
-from experiments.bench_measure import Row, beside, contestants, one_core
+from experiments.bench.iterations import Iteration, training
+from experiments.bench.measure import Row, beside, contestants, one_core
 
 ENV = "block_hopper"
 STEPS = 20_000  # of an iteration, unless it is the batch that changes

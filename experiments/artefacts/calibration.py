@@ -1,7 +1,7 @@
-"""How much the Block tasks allow: random policies and the blind gaits of experiments/gaits.json, on fresh episodes.
+"""How much the Block tasks allow: random policies and the blind gaits of gaits.json, on fresh episodes.
 
-    python -m experiments.calibration                   # the table of docs/environments/calibration.md, a few minutes
-    python -m experiments.calibration --figure fig3     # the finished runs of a figure, with walls and without
+    python -m experiments.artefacts.calibration                 # the table of docs/environments/calibration.md, minutes
+    python -m experiments.artefacts.calibration --figure fig3   # the finished runs of a figure, with walls and without
 
 Nothing is trained here.
 """
@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
+from experiments.artefacts.gait_search import TASKS, actions, committed, row
 from experiments.command_line import Parser, bad_input, run_command
-from experiments.crossings import Crossings, Walls, totals
+from experiments.crossings import CEILING, Crossings, Walls, totals
 from experiments.evaluate import evaluate, interval
-from experiments.gait_search import TASKS, actions, committed, row
 from experiments.plan import Entry, make_plan
 from hippo.core import seeding
 from hippo.core.checkpoint import CheckpointError
@@ -25,7 +25,6 @@ from hippo.envs import make
 from hippo.envs.blocks import TUMBLED
 
 Policy = Callable[[int, np.ndarray], np.ndarray]  # step, observations (N, D) -> actions (N, A)
-CEILING = {"block_hopper": 7.60, "block_half_cheetah": 16.27}  # walls per episode of the blind gait, as the page says
 HEADER = f"| task | policy | walls per episode | 95 % interval | with \\|pitch\\| > {TUMBLED:g} rad | torso at, m |"
 BLANKED = " of the blind gait's | walls blanked | 95 % interval |"
 
@@ -102,7 +101,7 @@ def trained_line(task: str, name: str, rows: Sequence[dict[str, Any]], blanked: 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measure from the command line."""
-    parser = Parser(prog="experiments.calibration", description=__doc__.splitlines()[0])
+    parser = Parser(prog="experiments.artefacts.calibration", description=__doc__.splitlines()[0])
     parser.add_argument("--task", choices=TASKS, help="this one only")
     parser.add_argument("--episodes", type=int, default=100)
     parser.add_argument("--seed", type=int, default=0)

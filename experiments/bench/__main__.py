@@ -13,17 +13,8 @@ from dataclasses import dataclass
 
 import torch
 
-from experiments import (
-    bench_environments,
-    bench_iterations,
-    bench_learning,
-    bench_memory,
-    bench_peers,
-    bench_scaling,
-    bench_sweeps,
-    bench_targets,
-)
-from experiments.bench_measure import Row
+from experiments.bench import environments, iterations, learning, memory, peers, scaling, sweeps, targets
+from experiments.bench.measure import Row
 from experiments.command_line import Parser, clock, duration, run_command
 from experiments.status import write_atomically
 
@@ -38,14 +29,14 @@ class Part:
 
 
 PARTS = {
-    "iterations": Part(bench_iterations.rows, 640, 60),
-    "environments": Part(bench_environments.rows, 80, 20),
-    "peers": Part(bench_peers.rows, 150, 20),
-    "scaling": Part(bench_scaling.rows, 220, 60),
-    "memory": Part(bench_memory.rows, 140, 30),
-    "workers": Part(bench_sweeps.rows, 140, 30),
-    "fig3": Part(bench_sweeps.front_door, 220, 0),
-    "learning": Part(bench_learning.rows, 3000, 60),
+    "iterations": Part(iterations.rows, 640, 60),
+    "environments": Part(environments.rows, 80, 20),
+    "peers": Part(peers.rows, 150, 20),
+    "scaling": Part(scaling.rows, 220, 60),
+    "memory": Part(memory.rows, 140, 30),
+    "workers": Part(sweeps.rows, 140, 30),
+    "fig3": Part(sweeps.front_door, 220, 0),
+    "learning": Part(learning.rows, 3000, 60),
 }
 APART = ("learning",)  # too long for the whole: done only where it is named
 
@@ -76,12 +67,12 @@ def main(arguments: list[str] | None = None) -> int:
     parser = Parser(prog="experiments.bench", description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="few and short measurements, to see that all works")
     parser.add_argument("--only", nargs="+", choices=PARTS, metavar="PART", help=f"some of: {', '.join(PARTS)}")
-    parser.add_argument("--write", action="store_true", help=f"put the table into docs/{bench_targets.PAGE.name}")
+    parser.add_argument("--write", action="store_true", help=f"put the table into docs/{targets.PAGE.name}")
     options = parser.parse_args(arguments)
     if options.write and (options.quick or options.only):
         parser.error("--write: needs the whole benchmark, without --quick and --only")
     if options.write:
-        bench_targets.with_block(bench_targets.PAGE.read_text(), "", [])  # refuses a page without marks now, not later
+        targets.with_block(targets.PAGE.read_text(), "", [])  # refuses a page without marks now, not later
     torch.set_num_threads(1)
     lines: list[str] = []
 
@@ -89,7 +80,7 @@ def main(arguments: list[str] | None = None) -> int:
         print(line, flush=True)
         lines.append(line)
 
-    about = bench_targets.machine()
+    about = targets.machine()
     print(about)
     try:
         measured = measure(options.only or [name for name in PARTS if name not in APART], options.quick, show)
@@ -97,11 +88,11 @@ def main(arguments: list[str] | None = None) -> int:
         print("\nstopped; nothing was written", file=sys.stderr)
         return 130
     show("")
-    for line in bench_targets.closing(measured):
+    for line in targets.closing(measured):
         show(line)
     if options.write:
-        page = bench_targets.PAGE
-        write_atomically(page, bench_targets.with_block(page.read_text(), about, lines[1:]))
+        page = targets.PAGE
+        write_atomically(page, targets.with_block(page.read_text(), about, lines[1:]))
         print(f"wrote {page}")
     return 0
 

@@ -1,7 +1,7 @@
 """What `physics="fast"` changes: docs/environments/fast_physics.md, with everything in it measured here.
 
-    python -m experiments.fidelity                       # a few minutes on one core
-    python -m experiments.fidelity --run runs/<run_id>   # the same with policies that were trained for longer
+    python -m experiments.artefacts.fidelity                       # a few minutes on one core
+    python -m experiments.artefacts.fidelity --run runs/<run_id>   # the same with policies that were trained for longer
 
 The same robots, seeds and random actions under both integrators; then one policy per task, trained under the paper's
 physics, evaluated under both.
@@ -16,13 +16,13 @@ import numpy as np
 
 from experiments import train
 from experiments.command_line import Parser, bad_input, run_command
-from experiments.config import Run, compose_run
+from experiments.config import ROOT, Run, compose_run
 from experiments.evaluate import evaluate, load_run
 from hippo.core.checkpoint import CheckpointError
 from hippo.core.settings import ConfigError
 from hippo.envs import ENVIRONMENTS, make
 
-PAGE = Path(__file__).parent.parent / "docs" / "environments" / "fast_physics.md"
+PAGE = ROOT / "docs" / "environments" / "fast_physics.md"
 ROBOTS = {"ant": "Ant", "snake": "Snake"}
 TASKS = {"ant_gather": "Ant Gather", "snake_gather": "Snake Gather"}
 NUM_ENVS, SECONDS = 64, 4.0  # the horizon of the Ant's pre-training
@@ -163,7 +163,7 @@ def suitable(folder: Path) -> Run:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measure and write the page."""
-    parser = Parser(prog="experiments.fidelity", description=__doc__.splitlines()[0])
+    parser = Parser(prog="experiments.artefacts.fidelity", description=__doc__.splitlines()[0])
     parser.add_argument("--run", type=Path, action="append", default=[], help="a run folder; may be given repeatedly")
     options = parser.parse_args(arguments)
     try:
@@ -178,7 +178,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         divergence.append(divergence_row(name, paper, fast))
     PAGE.write_text(
         TEXT.format(
-            command="python -m experiments.fidelity" + " --run runs/<run_id>" * bool(runs),
+            command="python -m experiments.artefacts.fidelity" + " --run runs/<run_id>" * bool(runs),
             num_envs=NUM_ENVS,
             seconds=SECONDS,
             distributions="\n".join(distributions),

@@ -16,10 +16,11 @@ import xml.sax.saxutils
 from collections.abc import Sequence
 from pathlib import Path
 
-from experiments.bench_iterations import Iteration, training
+from experiments.bench.iterations import Iteration, training
 from experiments.command_line import EXIT_FAILED, run_command
+from experiments.config import ROOT
 
-PICTURE = Path(__file__).parent.parent / "docs" / "pictures" / "profile_ant_gather.svg"
+PICTURE = ROOT / "docs" / "pictures" / "profile_ant_gather.svg"
 TITLE = "One HiPPO iteration, Ant Gather at the paper's batch: share of its wall time by function (py-spy)"
 RUN = ("env=ant_gather", "algo=hippo", "scale=paper")
 WIDTH, CHARACTER = 1180, 7.2  # pixels: of the whole graph, of a letter in its monospaced font of 12

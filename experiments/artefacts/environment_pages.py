@@ -1,6 +1,6 @@
 """The generated tables of docs/environments: what is observed, which options there are, what a perturbation changes.
 
-    python -m experiments.environment_pages        # renews them; the text around them is written by hand
+    python -m experiments.artefacts.environment_pages        # renews them; the text around them is written by hand
 
 Every page is docs/environments/<environment>.md; a table stands between `<!-- table: NAME -->` and `<!-- end -->`.
 """
@@ -14,11 +14,12 @@ import mujoco
 import numpy as np
 
 from experiments.command_line import run_command
+from experiments.config import ROOT
 from hippo.envs import ENVIRONMENTS, gymnasium_id, make
 from hippo.envs.perturb import PERTURBATIONS, STRENGTHS, change_of
 from hippo.envs.registration import Options
 
-FOLDER = Path(__file__).parent.parent / "docs" / "environments"
+FOLDER = ROOT / "docs" / "environments"
 STEPS = 50  # of the comparison that finds out whether a perturbation changes anything
 MARK = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 

@@ -15,7 +15,7 @@ from typing import Any
 
 import baselines.ppo
 import hippo.hippo
-from experiments.bench_measure import (
+from experiments.bench.measure import (
     Row,
     beside,
     contestants,

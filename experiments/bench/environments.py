@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 import gymnasium as gym
 import numpy as np
 
-from experiments.bench_measure import (
+from experiments.bench.measure import (
     Row,
     beside,
     contestants,

@@ -5,14 +5,14 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-from experiments.bench_iterations import ENVIRONMENTS
-from experiments.bench_measure import Row
+from experiments.bench.iterations import ENVIRONMENTS
+from experiments.bench.measure import Row
 
 
 def peak_memory(overrides: list[str]) -> float:
     """Peak resident memory in MB of a fresh process that trains as `overrides` say."""
     code = (
-        "import sys, tempfile; from experiments.train import main; from experiments.bench_memory import own_peak\n"
+        "import sys, tempfile; from experiments.train import main; from experiments.bench.memory import own_peak\n"
         "with tempfile.TemporaryDirectory() as folder: main([*sys.argv[1:], 'runs_dir=' + folder])\n"
         "print(own_peak())"
     )

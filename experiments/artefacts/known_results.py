@@ -1,11 +1,11 @@
 """Learning results of other papers, reproduced at reduced budget: that a competitor here is as strong as its authors'.
 
-    python -m experiments.known_results option_critic --seeds 3 --runs-dir runs/known_results
+    python -m experiments.artefacts.known_results option_critic --seeds 3 --runs-dir runs/known_results
 
 trains Option-Critic with two options on Gymnasium's Hopper-v5 for 10^6 steps, with the settings that PPOC was published
 with, and draws the learning curves. PPOC's published curves end between 2000 and 2250 (on Hopper-v1).
 
-    python -m experiments.known_results mlsh
+    python -m experiments.artefacts.known_results mlsh
 
 trains MLSH with two sub-policies on movement bandits, whose right goal a fresh master has to find out: the published
 finding is that the sub-policies come to walk to one goal each, so that it soon does. An interrupted run goes on where

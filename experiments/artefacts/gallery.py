@@ -1,6 +1,6 @@
 """How diverse the skills of a skills file are: measured on fresh paths, beside skills that nobody trained.
 
-    python -m experiments.gallery paper_figures/data/skills/ant.pt [--paths 600] [--out DIR] [--videos DIR]
+    python -m experiments.artefacts.gallery paper_figures/data/skills/ant.pt [--paths 600] [--out DIR] [--videos DIR]
 
 writes beside the file, or in --out, <name>.metrics.csv, <name>.paths.csv (some paths) and <name>.visits.csv (visits per
 cell), which `python -m paper_figures.gallery` draws, and with --videos a short video of each skill. docs/skills.md has
@@ -297,7 +297,7 @@ def film(path: Path, folder: Path, seed: int) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measure and film from the command line."""
-    parser = Parser(prog="experiments.gallery", description=__doc__.splitlines()[0])
+    parser = Parser(prog="experiments.artefacts.gallery", description=__doc__.splitlines()[0])
     parser.add_argument("skills", type=Path, nargs="+", help="skills files")
     parser.add_argument("--paths", type=int, default=600, help="fresh paths of the skills, and of random ones")
     parser.add_argument("--seed", type=int, default=0)

@@ -12,7 +12,7 @@ import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from experiments.bench_measure import Row, beside
+from experiments.bench.measure import Row, beside
 from experiments.config import Run, compose_run
 from experiments.launchers import run_locally
 

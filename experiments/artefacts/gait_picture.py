@@ -1,6 +1,6 @@
-"""The blind gaits of experiments/gaits.json as a picture: a strip of frames per task, around the clearing of a wall.
+"""The blind gaits of gaits.json as a picture: a strip of frames per task, around the clearing of a wall.
 
-    python -m experiments.gait_picture docs/pictures/gaits.png
+    python -m experiments.artefacts.gait_picture docs/pictures/gaits.png
 
 Needs EGL or OSMesa (`make install-render`).
 """
@@ -12,9 +12,9 @@ from pathlib import Path
 import imageio.v2 as imageio
 import numpy as np
 
-from experiments.calibration import blind_gait
+from experiments.artefacts.calibration import blind_gait
+from experiments.artefacts.gait_search import TASKS
 from experiments.command_line import EXIT_FAILED, Parser, bad_input, check_writable, run_command
-from experiments.gait_search import TASKS
 from hippo.core import seeding
 from hippo.core.settings import ConfigError
 from hippo.envs import make
@@ -58,7 +58,7 @@ def steps_until(task: str, walls: int) -> int:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Draw from the command line."""
-    parser = Parser(prog="experiments.gait_picture", description=__doc__.splitlines()[0])
+    parser = Parser(prog="experiments.artefacts.gait_picture", description=__doc__.splitlines()[0])
     parser.add_argument("out", type=Path, help="png to write")
     options = parser.parse_args(arguments)
     try:

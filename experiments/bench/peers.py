@@ -14,9 +14,9 @@ import gymnasium as gym
 import torch
 from torch import nn
 
-from experiments.bench_environments import registered
-from experiments.bench_iterations import training
-from experiments.bench_measure import (
+from experiments.bench.environments import registered
+from experiments.bench.iterations import training
+from experiments.bench.measure import (
     CORES,
     Row,
     beside,

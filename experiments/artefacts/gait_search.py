@@ -1,10 +1,10 @@
 """A blind gait for each Block task: what the task allows a policy that sees nothing, found without learning.
 
-    python -m experiments.gait_search block_hopper        # searches, half an hour; writes experiments/gaits.json
+    python -m experiments.artefacts.gait_search block_hopper        # searches, half an hour; writes gaits.json
 
 One sinusoid per joint, all of one frequency. The cross-entropy method looks for the parameters that take the robot
 far: a candidate's score is its return plus its distance in walls, since walls alone reward hardly any beginner.
-`python -m experiments.calibration` measures what is found.
+`python -m experiments.artefacts.calibration` measures what is found.
 """
 
 import dataclasses
@@ -22,7 +22,7 @@ from hippo.core.settings import ConfigError
 from hippo.envs import ENVIRONMENTS, make
 from hippo.envs.blocks import SPACING, Blocks
 
-FOUND = Path(__file__).parent / "gaits.json"
+FOUND = Path(__file__).with_name("gaits.json")
 TASKS = tuple(name for name, environment in ENVIRONMENTS.items() if environment.task is Blocks)
 STEPS = 4_000_000  # environment steps of a search
 CANDIDATES, EPISODES, ELITES = 60, 2, 8  # of one generation; each candidate runs so many episodes
@@ -99,7 +99,7 @@ def search(task: str, steps: int, seed: int, horizon: int | None = None, report:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Search from the command line."""
-    parser = Parser(prog="experiments.gait_search", description=__doc__.splitlines()[0])
+    parser = Parser(prog="experiments.artefacts.gait_search", description=__doc__.splitlines()[0])
     parser.add_argument("task", choices=TASKS)
     parser.add_argument("--steps", type=int, default=STEPS, help=f"environment steps, default {STEPS}")
     parser.add_argument("--seed", type=int, default=0)
