@@ -5,10 +5,15 @@ import re
 import subprocess
 
 import pytest
+import yaml
 
 from tests import ROOT
 
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+PAGES = [
+    *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")),
+    *sorted((ROOT / "docs").rglob("*.md")),
+]
+MAKEFILE = (ROOT / "Makefile").read_text()
 ids = [str(page.relative_to(ROOT)) for page in PAGES]
 
 
@@ -20,7 +25,7 @@ def links(text):
 
 def targets():
     """Names of the Makefile's targets, patterns expanded."""
-    names = set(re.findall(r"^([a-z%-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    names = set(re.findall(r"^([a-z%-]+):", MAKEFILE, re.MULTILINE))
     return names | {path.stem for path in (ROOT / "paper_figures").glob("*.py")}
 
 
@@ -57,6 +62,28 @@ def test_tests_are_run_by_the_group_and_a_wrong_one_is_one_line_that_names_the_c
     assert all(
         f" {group}" in line for group in ("analysis", "baselines", "docs", "envs", "experiments", "figures", "hippo")
     )
+
+
+def test_every_commit_of_the_changelog_is_one_of_ours():
+    named = re.findall(r"`([0-9a-f]{7})`", (ROOT / "CHANGELOG.md").read_text())
+    assert len(named) > 5
+    command = ["git", "cat-file", "-e"]
+    if subprocess.run([*command, "HEAD~20"], cwd=ROOT, capture_output=True, check=False).returncode:
+        pytest.skip("no history here")
+    assert not [name for name in named if subprocess.run([*command, name], cwd=ROOT, check=False).returncode]
+
+
+def test_issues_about_numbers_are_asked_for_run_manifest_and_cpu():
+    text = (ROOT / ".github/ISSUE_TEMPLATE/number.md").read_text()
+    assert all(word in text for word in ("run_id", "manifest.json", "CPU"))
+
+
+def test_what_is_checked_before_a_commit_is_what_make_lint_checks():
+    hooks = yaml.safe_load((ROOT / ".pre-commit-config.yaml").read_text())["repos"][0]["hooks"]
+    tools = {hook["entry"].split()[0] for hook in hooks} - {"sh"}
+    assert tools == {
+        tool.replace("$(BIN)", ".venv/bin") for tool in re.findall(r"^\t(\$\(BIN\)/(?:ruff|mypy))", MAKEFILE, re.M)
+    }
 
 
 def test_the_readme_activates_the_environment_before_the_first_python_command():
