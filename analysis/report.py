@@ -19,7 +19,8 @@ from markupsafe import Markup, escape
 
 from analysis.command_line import parser
 from analysis.edition import chosen
-from analysis.report_data import Artefact, Report, RunFacts, Table, gather
+from analysis.report_data import Artefact, Report, Table, gather
+from analysis.report_runs import RunFacts
 from analysis.runs import MissingData
 
 HERE = Path(__file__).parent

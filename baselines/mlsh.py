@@ -20,16 +20,8 @@ from hippo.core import seeding
 from hippo.core.advantages import Advantages, Baselines, advantages, masked_standardize
 from hippo.core.checkpoint import Checkpoint
 from hippo.core.gae import segment_gae
-from hippo.core.hierarchy import (
-    Acting,
-    Batch,
-    HierarchicalPolicy,
-    HierarchyConfig,
-    collect,
-    levels,
-    policy_statistics,
-    restored,
-)
+from hippo.core.hierarchy import Acting, Batch, HierarchicalPolicy, HierarchyConfig, collect, restored
+from hippo.core.levels import levels, policy_statistics
 from hippo.core.log import RunLog, check_finite
 from hippo.core.minibatch import maximize_in_minibatches
 from hippo.core.optimizers import Adam

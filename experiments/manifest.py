@@ -13,7 +13,8 @@ from typing import Any
 
 import torch
 
-from experiments.config import ROOT, Run
+from experiments.choices import ROOT
+from experiments.config import Run
 from experiments.status import read_status
 from hippo.core.files import DamagedFile, read_json, set_aside
 from hippo.core.settings import ConfigError

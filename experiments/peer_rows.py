@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from experiments.config import COMMITTED
+from experiments.choices import COMMITTED
 
 ROWS = COMMITTED / "studies" / "stable_baselines3.csv"
 COLUMNS = ["env", "seed", "env_steps", "seconds", "return_mean"]

@@ -28,9 +28,10 @@ import yaml
 from analysis import stats
 from analysis.runs import COLUMNS, Results, read_committed, read_progress, scores
 from experiments import peer_rows, sweep
+from experiments.choices import COMMITTED, CONF, ROOT, check_choice, choices
 from experiments.command_line import EXIT_FAILED, EXIT_REQUEUE, Parser, bad_input, clock, run_command
 from experiments.commit import as_csv
-from experiments.config import COMMITTED, CONF, ROOT, Run, check_choice, choices, compose_run
+from experiments.config import Run, compose_run
 from experiments.plan import Entry, env_label
 from experiments.status import DONE, check_locks, read_status, write_atomically
 from hippo.core.settings import ConfigError

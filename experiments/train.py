@@ -28,10 +28,12 @@ from filelock import Timeout
 
 from experiments import usage
 from experiments.command_line import EXIT_DIVERGED, EXIT_FAILED, EXIT_REQUEUE, Parser, bad_input, clock, run_command
-from experiments.config import PRETRAINED, Run, committed_skills, compose_run, unquoted
+from experiments.config import Run, committed_skills, compose_run
 from experiments.console import unattended
 from experiments.evaluate import as_csv, evaluate_all
 from experiments.manifest import from_manifest, manifest_with_history
+from experiments.refusals import unquoted
+from experiments.schema import PRETRAINED
 from experiments.status import (
     HEARTBEAT_SECONDS,
     SILENT,

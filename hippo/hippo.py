@@ -25,15 +25,8 @@ from torch import nn
 from hippo.core import seeding
 from hippo.core.advantages import Baselines, advantages
 from hippo.core.checkpoint import Checkpoint
-from hippo.core.hierarchy import (
-    Acting,
-    HierarchicalPolicy,
-    HierarchyConfig,
-    collect,
-    levels,
-    policy_statistics,
-    restored,
-)
+from hippo.core.hierarchy import Acting, HierarchicalPolicy, HierarchyConfig, collect, restored
+from hippo.core.levels import levels, policy_statistics
 from hippo.core.log import RunLog, check_finite
 from hippo.core.on_policy import SurrogateConfig, improve, make_optimizer
 from hippo.core.settings import ConfigError, setting

@@ -10,8 +10,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from experiments import costs
+from experiments.choices import ROOT, choices
 from experiments.command_line import Parser, duration, run_command
-from experiments.config import ROOT, Run, choices
+from experiments.config import Run
 from experiments.plan import Plan, make_plan, unique
 from experiments.status import write_atomically
 

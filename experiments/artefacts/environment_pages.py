@@ -13,8 +13,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from experiments.choices import ROOT
 from experiments.command_line import run_command
-from experiments.config import ROOT
 from hippo.envs import ENVIRONMENTS, gymnasium_id, make
 from hippo.envs.perturb import PERTURBATIONS, STRENGTHS, change_of
 from hippo.envs.registration import Options

@@ -15,8 +15,9 @@ from pathlib import Path
 import numpy as np
 
 from experiments import train
+from experiments.choices import ROOT
 from experiments.command_line import Parser, bad_input, run_command
-from experiments.config import ROOT, Run, compose_run
+from experiments.config import Run, compose_run
 from experiments.evaluate import evaluate, load_run
 from hippo.core.checkpoint import CheckpointError
 from hippo.core.settings import ConfigError

@@ -9,8 +9,9 @@ import csv
 import dataclasses
 import io
 
+from experiments.choices import ROOT
 from experiments.command_line import run_command
-from experiments.config import ROOT, default_of
+from experiments.schema import default_of
 from hippo.learners import LEARNERS, config_class
 
 DOCS = ROOT / "docs"

@@ -17,8 +17,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from experiments.bench.iterations import Iteration, training
+from experiments.choices import ROOT
 from experiments.command_line import EXIT_FAILED, run_command
-from experiments.config import ROOT
 
 PICTURE = ROOT / "docs" / "pictures" / "profile_ant_gather.svg"
 TITLE = "One HiPPO iteration, Ant Gather at the paper's batch: share of its wall time by function (py-spy)"

@@ -7,7 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from experiments.config import ROOT, installed
+from experiments.choices import ROOT
+from experiments.config import installed
 
 PAGE = ROOT / "docs" / "performance.md"
 MARK = re.compile(r"(<!-- bench -->\n).*?(<!-- end -->)", re.DOTALL)

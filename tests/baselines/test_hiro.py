@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import nn
 
-from baselines import hiro
+from baselines import hiro, hiro_levels
 from baselines.hiro import Agents, HiroConfig, Walk
 from hippo.core.acting import rollout
 from hippo.core.checkpoint import Checkpoint
@@ -149,7 +149,7 @@ def corrected(weight, rows, candidates, monkeypatch, goals=LINE):
     """The goals that `relabel` chooses among `candidates` (B, M, k) for a lower level that acts linearly."""
     agents = Agents(small(period=rows["action"].shape[1]), goals, 1, 1, generator())
     agents.low.actor = Linear(weight)
-    monkeypatch.setattr(hiro, "candidate_goals", lambda *_: candidates)
+    monkeypatch.setattr(hiro_levels, "candidate_goals", lambda *_: candidates)
     return agents.relabel(rows, generator())
 
 

@@ -16,7 +16,8 @@ from hippo.core.acting import rollout
 from hippo.core.advantages import Baselines, advantages
 from hippo.core.checkpoint import Checkpoint, load
 from hippo.core.gae import gae, segment_gae
-from hippo.core.hierarchy import HierarchicalPolicy, collect, levels
+from hippo.core.hierarchy import HierarchicalPolicy, collect
+from hippo.core.levels import levels
 from hippo.core.log import RunLog
 from hippo.core.minibatch import maximize_in_minibatches, minibatches
 from hippo.core.policies import Manager

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from baselines import option_critic as oc
+from baselines.option_critic_advantages import arrival_value
 from hippo.core.acting import rollout
 from hippo.core.checkpoint import Checkpoint, load
 from hippo.core.gae import gae
@@ -54,7 +55,7 @@ def fixed_point(beta, gamma=0.9):
     """Q of one state where option 0 earns 1 and option 1 nothing, under a uniform policy over options."""
     q, reward = torch.zeros(2, dtype=torch.float64), torch.tensor([1.0, 0.0], dtype=torch.float64)
     for _ in range(2000):
-        q = reward + gamma * oc.arrival_value(q, q.mean(), beta, 0.0)
+        q = reward + gamma * arrival_value(q, q.mean(), beta, 0.0)
     return q
 
 

@@ -9,7 +9,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from experiments.config import ConfigError, compose_run
 from experiments.train import execute, prepare
 from hippo.core.rollout import Steps
-from hippo.envs import environment, foreign, make
+from hippo.envs import environment, foreign, layout, make
 from hippo.envs.foreign import EnvironmentFault, Refused
 
 
@@ -204,9 +204,9 @@ def test_what_cannot_be_trained_is_refused_by_name(overrides, words):
 
 def test_unbounded_actions_and_pictures_are_refused():
     with pytest.raises(Refused, match="valid are bounded actions"):
-        foreign._action_range("gym:X", gym.spaces.Box(-np.inf, np.inf, (2,)))
+        layout._action_range("gym:X", gym.spaces.Box(-np.inf, np.inf, (2,)))
     with pytest.raises(Refused, match=r"observes Box; valid are Boxes of one dimension"):
-        list(foreign._parts("gym:X", gym.spaces.Box(0, 255, (9, 9, 3), np.uint8)))
+        list(layout._parts("gym:X", gym.spaces.Box(0, 255, (9, 9, 3), np.uint8)))
 
 
 def test_the_run_id_holds_the_id_the_package_and_the_arguments():

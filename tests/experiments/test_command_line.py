@@ -12,18 +12,10 @@ import pytest
 from analysis import claims, report
 from analysis.command_line import PROTOCOLS, SCALES
 from experiments import sweep, synonyms, train
-from experiments.config import (
-    BUDGET_FIELDS,
-    COMMITTED,
-    GROUPS,
-    LEARNERS,
-    PLAIN_TEXT,
-    PRETRAINING,
-    Run,
-    choices,
-    compose_run,
-)
+from experiments.choices import COMMITTED, GROUPS, choices
+from experiments.config import LEARNERS, PLAIN_TEXT, Run, compose_run
 from experiments.plan import make_plan
+from experiments.schema import BUDGET_FIELDS, PRETRAINING
 from hippo.core.settings import ConfigError
 from hippo.envs import ENVIRONMENTS, make
 from paper_figures import draw

@@ -16,7 +16,8 @@ import pytest
 
 from analysis.edition import Edition
 from experiments import costs, launchers, status, sweep, train
-from experiments.config import COMMITTED, Run, compose_run
+from experiments.choices import COMMITTED
+from experiments.config import Run, compose_run
 from experiments.plan import Plan, committed_runs, make_plan
 from experiments.status import Status, read_status
 from hippo.core.checkpoint import load

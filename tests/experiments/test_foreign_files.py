@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from analysis import explain, report_data, runs, stats
-from experiments import costs, evaluate, launchers, slurm, slurm_profile, sweep, train
+from analysis import explain, report_runs, runs, stats
+from experiments import code_snapshot, costs, evaluate, launchers, slurm, slurm_profile, sweep, train
 from experiments.config import compose_run
 from experiments.status import (
     SILENT,
@@ -223,8 +223,8 @@ def test_a_link_in_a_run_s_folder_is_not_read(tmp_path):
     folder.mkdir(parents=True)
     (folder / "a.mp4").symlink_to(tmp_path / "secret.mp4")
     (folder / "b.mp4").write_bytes(b"own")
-    facts = report_data.RunFacts(RUN["run_id"])
-    report_data.read_folder(facts, tmp_path / "runs")
+    facts = report_runs.RunFacts(RUN["run_id"])
+    report_runs.read_folder(facts, tmp_path / "runs")
     assert facts.videos == [folder / "b.mp4"]
 
 
@@ -534,43 +534,43 @@ def code(tmp_path, monkeypatch):
     }.items():
         (root / name).parent.mkdir(parents=True, exist_ok=True)
         (root / name).write_text(text)
-    monkeypatch.setattr(slurm, "ROOT", root)
-    monkeypatch.setattr(slurm, "git", lambda *_: None)
+    monkeypatch.setattr(code_snapshot, "ROOT", root)
+    monkeypatch.setattr(code_snapshot, "git", lambda *_: None)
     return root
 
 
 def test_a_snapshot_holds_code_only_and_there_is_one_per_digest(code):
-    first = slurm.snapshot(code / "runs/slurm")
+    first = code_snapshot.snapshot(code / "runs/slurm")
     held = {str(path.relative_to(first)) for path in first.rglob("*") if path.is_file()}
     assert held == {"hippo/a.py", "experiments/conf/b.yaml", "requirements.lock", "snapshot.json"}
     (code / "runs/r/more.py").write_text("run")
-    assert slurm.snapshot(code / "runs/slurm") == first
+    assert code_snapshot.snapshot(code / "runs/slurm") == first
     (code / "hippo/a.py").write_text("x = 2")
-    assert slurm.snapshot(code / "runs/slurm") != first
+    assert code_snapshot.snapshot(code / "runs/slurm") != first
 
 
 def test_a_snapshot_has_a_limit(code, monkeypatch):
-    monkeypatch.setattr(slurm, "MOST_CODE", 5)
+    monkeypatch.setattr(code_snapshot, "MOST_CODE", 5)
     with pytest.raises(ConfigError, match="at most 5 bytes"):
-        slurm.snapshot(code / "runs/slurm")
+        code_snapshot.snapshot(code / "runs/slurm")
 
 
 @pytest.mark.parametrize("name", ["hippo/a.py", "sitecustomize.py", "hippo/link.py", "hippo/torch.pth"])
 def test_a_planted_snapshot_is_not_taken(name, code):
-    target = slurm.snapshot(code / "runs/slurm")
+    target = code_snapshot.snapshot(code / "runs/slurm")
     planted = target / name
     planted.unlink(missing_ok=True)
     planted.symlink_to(code / "hippo/a.py") if "link" in name else planted.write_text("import os")
     with pytest.raises(ConfigError, match="is not the code that its name says"):
-        slurm.snapshot(code / "runs/slurm")
+        code_snapshot.snapshot(code / "runs/slurm")
 
 
 def test_planted_bytecode_in_a_snapshot_is_not_run(code):
-    target = slurm.snapshot(code / "runs/slurm")
+    target = code_snapshot.snapshot(code / "runs/slurm")
     for name in ("hippo/__pycache__/a.cpython-311.pyc", "hippo/__pycache__/a.f-1.py311.nbc"):
         (target / name).parent.mkdir(exist_ok=True)
         (target / name).write_bytes(b"planted")
-    slurm.snapshot(code / "runs/slurm")
+    code_snapshot.snapshot(code / "runs/slurm")
     assert not list((target / "hippo/__pycache__").iterdir())
 
 

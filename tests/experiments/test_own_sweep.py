@@ -11,10 +11,12 @@ import time
 import pytest
 
 from experiments import sweep
-from experiments.config import COMMITTED, compose_run
-from experiments.own_sweep import UNASKED, stored, values_of
+from experiments.choices import COMMITTED
+from experiments.config import compose_run
+from experiments.own_sweep import UNASKED, stored
 from experiments.plan import make_plan
 from experiments.status import Status, read_status
+from experiments.sweep_grammar import values_of
 from experiments.train import execute
 from hippo.core.settings import ConfigError
 from tests import ROOT

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from experiments import study
-from experiments.config import choices
+from experiments.choices import choices
 from experiments.status import write_atomically
 
 TWO = {

@@ -15,8 +15,9 @@ import pytest
 
 from experiments import launchers, sweep, train
 from experiments.command_line import EXIT_FAILED, EXIT_REQUEUE
-from experiments.config import ONE_VALUE, compose_run
+from experiments.config import compose_run
 from experiments.plan import FIXED, make_plan
+from experiments.refusals import ONE_VALUE
 from experiments.status import Status, mark_lost, read_status
 from tests import ROOT
 

@@ -9,7 +9,7 @@ import torch
 from PIL import Image
 
 from analysis.edition import Edition
-from experiments import config, plan
+from experiments import choices, config, plan
 from experiments.train import execute
 from tests import ROOT
 
@@ -23,7 +23,7 @@ off_policy: {iterations: 2, batch_size: 40}
 budget:
 """
 OVERRIDES = ["algo.gamma=0.9", "algo.clip_range=0.2"]
-FIGURES = sorted(path.stem for path in (config.CONF / "figure").glob("*.yaml"))
+FIGURES = sorted(path.stem for path in (choices.CONF / "figure").glob("*.yaml"))
 ARTEFACTS = sorted(path.stem for stem in ("fig", "table") for path in (ROOT / "paper_figures").glob(f"{stem}[0-9]*.py"))
 
 
@@ -32,7 +32,7 @@ def runs(tmp_path_factory):
     """A runs folder with all runs of all figures."""
     folder = tmp_path_factory.mktemp("tiny")
     conf = folder / "conf"
-    shutil.copytree(config.CONF, conf)
+    shutil.copytree(choices.CONF, conf)
     budgets = [f"  {task}: {{iterations: 2, batch_size: 40, horizon: 20, physics: fast}}\n" for task in TASKS]
     paper = [line.replace("fast", "paper") if "hopper" in line or "cheetah" in line else line for line in budgets]
     (conf / "scale" / f"{SCALE}.yaml").write_text(YAML + "".join(paper))
@@ -43,7 +43,7 @@ def runs(tmp_path_factory):
         path.write_text(path.read_text().replace("smoke:", f"{SCALE}:"))
     threads = torch.get_num_threads()
     with pytest.MonkeyPatch.context() as patch:
-        for module in (config, plan):
+        for module in (choices, config, plan):
             patch.setattr(module, "CONF", conf)
         config._base.cache_clear()
         for figure in FIGURES:

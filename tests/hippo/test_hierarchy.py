@@ -3,7 +3,8 @@
 import pytest
 import torch
 
-from hippo.core.hierarchy import HierarchicalPolicy, collect, in_whole_periods, levels, policy_statistics, with_time
+from hippo.core.hierarchy import HierarchicalPolicy, collect, in_whole_periods, with_time
+from hippo.core.levels import levels, policy_statistics
 from hippo.hippo import HippoConfig
 from tests.hippo.toy import TargetEnv
 

@@ -14,7 +14,8 @@ from torch import nn
 
 from hippo.core import networks
 from hippo.core.advantages import Baselines
-from hippo.core.hierarchy import HierarchicalPolicy, collect, levels
+from hippo.core.hierarchy import HierarchicalPolicy, collect
+from hippo.core.levels import levels
 from hippo.core.networks import grouped_layers, mlp
 from hippo.core.on_policy import improve, make_optimizer
 from tests.hippo.test_training import learner

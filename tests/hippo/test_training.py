@@ -10,7 +10,8 @@ from baselines import hier_vpg, hiro, mlsh, option_critic, ppo
 from hippo import hippo
 from hippo.core import seeding
 from hippo.core.checkpoint import Checkpoint, load
-from hippo.core.hierarchy import HierarchicalPolicy, collect, levels
+from hippo.core.hierarchy import HierarchicalPolicy, collect
+from hippo.core.levels import levels
 from hippo.core.log import Diverged
 from hippo.core.policies import GaussianPolicy
 from hippo.core.ppo import maximize
