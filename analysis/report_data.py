@@ -12,11 +12,11 @@ from typing import Any
 from PIL import Image
 
 from analysis import explain
+from analysis.command_line import ROOT
 from analysis.edition import OVERRIDDEN, Edition
 from analysis.report_runs import RunFacts, read_json, read_runs
 from analysis.runs import MissingData, check_edition, check_figure
 
-ROOT = Path(__file__).parent.parent
 LEDGER = ROOT / "docs" / "hyperparameters.csv"
 OWN_FILES = ("claims", "report")  # Markdown files of a scale's folder that are no tables
 STATING = (".pdf", ".svg", ".png", ".tex")  # files that state the runs behind them

@@ -10,7 +10,7 @@ discriminator, which would otherwise only have to measure distance. docs/algorit
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -28,13 +28,12 @@ from hippo.core.policies import SkillPolicy
 from hippo.core.ppo import in_chunks
 from hippo.core.pretraining import Paths, PretrainingConfig, train_skills, trained_skills
 from hippo.core.settings import WIDEST, setting
+from hippo.core.training import MakeEnvs
 
 __all__ = ["DIAYNConfig", "skills", "train"]
 
 REVISION = 1  # bumped by every change that alters the metrics of tests/golden
 ABSOLUTE = ("x", "y", "com_x", "com_y")  # entries that grow with the distance travelled
-
-MakeEnvs = Callable[[int, str], Any]  # (num_envs, purpose) -> a vector environment that knows its robot_size
 
 
 @dataclass

@@ -14,7 +14,7 @@ Source: tensorflow/models, research/efficient-hrl at 052361de. docs/algorithms/h
 """
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -28,12 +28,11 @@ from hippo.core import seeding
 from hippo.core.checkpoint import Checkpoint
 from hippo.core.goals import Memory
 from hippo.core.log import RunLog, check_finite
+from hippo.core.training import MakeEnvs, Training
 
 __all__ = ["Acting", "HiroConfig", "restored", "train"]
 
 REVISION = 1  # bumped by every change that alters the metrics of tests/golden
-
-MakeEnvs = Callable[[int, str], Any]  # (num_envs, purpose) -> a vector environment that knows its robot_size
 
 
 def restored(config: HiroConfig, envs: Any, checkpoint: Checkpoint) -> Agents:
@@ -130,8 +129,8 @@ def train(config: HiroConfig, make_envs: MakeEnvs, log: RunLog, seed: int, check
     settings = config.manager_reward_scale, config.ignore_terminals
     memory = Memory(config.replay_size, envs.num_envs, (config.period, *sizes), *settings)
     parts: dict[str, Any] = {"agents": agents} | agents.optimizers() | memory.parts
-    first = checkpoint.restore(**parts)
-    log.resume(first)
+    training = Training(log, checkpoint, parts)
+    first = training.begin()
     if config.skills and first == 0:
         demonstrators = make_envs(-(-config.cloning_steps // config.horizon), "given skills")
         demonstrated = Memory(config.replay_size, demonstrators.num_envs, (config.period, *sizes), *settings)
@@ -163,14 +162,10 @@ def train(config: HiroConfig, make_envs: MakeEnvs, log: RunLog, seed: int, check
             memory.manager.clear()
         end = time.perf_counter()
         metrics = {
-            "iteration": iteration,
-            "env_steps": env_steps,
-            **walk.steps.statistics(),
             **learner.metrics(),
             "goal_size": float(torch.cat(goal_size).mean()),
             "goal_distance": float(torch.cat(distances).mean()),
         }
-        log.row(metrics, walk.steps.timing(start, end - learner.seconds, end))
-        checkpoint.record(iteration, **parts)
+        training.record(iteration, walk.steps, (start, end - learner.seconds, end), metrics)
     checkpoint.previous.unlink(missing_ok=True)  # it alone still holds the buffers, up to half a gigabyte
     envs.close()

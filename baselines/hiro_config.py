@@ -4,12 +4,13 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Any
 
+from hippo.core.budget import BudgetConfig
 from hippo.core.goals import BODY_GOALS, GOAL_SPACES
-from hippo.core.settings import MOST_STEPS, WIDEST, ConfigError, check, setting
+from hippo.core.settings import MOST_STEPS, WIDEST, ConfigError, setting
 
 
 @dataclass
-class HiroConfig:
+class HiroConfig(BudgetConfig):
     """The settings of HIRO."""
 
     iterations: int = setting(dataclasses.MISSING, "training iterations", ours="HIRO's own 10 M steps", low=1)
@@ -19,9 +20,6 @@ class HiroConfig:
         ours="one horizon of a few environments",
         low=1,
         high=MOST_STEPS,
-    )
-    horizon: int = setting(
-        dataclasses.MISSING, "episode length H in steps", paper="Block 1000, Ant 5000, Snake 8000 (App. A)", low=1
     )
     period: int = setting(10, "c, steps between two goals", code="10 (ant_maze.gin:27)", low=1)
     goal_space: str = setting(
@@ -90,9 +88,7 @@ class HiroConfig:
     cloning_updates: int = setting(5000, "minibatches of behaviour cloning", ours="25 passes over the roll-outs", low=1)
 
     def __post_init__(self) -> None:
-        check(self)
-        if self.batch_size < self.horizon:
-            raise ConfigError("batch_size", self.batch_size, f"must be at least one horizon, {self.horizon} steps")
+        super().__post_init__()
         if self.period > self.horizon:
             raise ConfigError("period", self.period, f"must be at most the horizon, {self.horizon} steps")
         if self.replay_size < self.minibatch_size:
@@ -100,11 +96,6 @@ class HiroConfig:
             raise ConfigError("replay_size", self.replay_size, valid)
         if len(self.hidden_sizes) != 2:
             raise ConfigError("hidden_sizes", self.hidden_sizes, "must be two layers")
-
-    @property
-    def num_envs(self) -> int:
-        """Environments side by side, each for one horizon; ceil(batch / horizon)."""
-        return -(-self.batch_size // self.horizon)
 
     def check_environment(self, robot: str, options: dict[str, Any], layout: Any = None) -> None:
         """Refuse goals about entries that the environment's observation, of gym:<id> its `layout`, does not have."""

@@ -10,7 +10,6 @@ import dataclasses
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -29,13 +28,12 @@ from hippo.core.policies import Manager
 from hippo.core.ppo import Level
 from hippo.core.settings import ConfigError, setting
 from hippo.core.skills import start_from
+from hippo.core.training import MakeEnvs, Training
 from hippo.core.value import ValueFunction, explained_variance
 
 __all__ = ["Acting", "MLSHConfig", "restored", "train"]
 
 REVISION = 1  # bumped by every change that alters the metrics of tests/golden
-
-MakeEnvs = Callable[[int, str], Any]  # (num_envs, purpose) -> a vector environment that knows its robot_size
 
 
 @dataclass
@@ -241,10 +239,9 @@ def train(config: MLSHConfig, make_envs: MakeEnvs, log: RunLog, seed: int, check
         "manager_optimizer": optimizers["manager"],
         "skill_optimizer": optimizers["skill"],
     }
-    first = checkpoint.restore(**parts)
-    log.resume(first)
+    training = Training(log, checkpoint, parts)
 
-    for iteration in range(first, config.iterations):
+    for iteration in range(training.begin(), config.iterations):
         start = time.perf_counter()
         cycle, cycle_iteration = divmod(iteration, config.cycle_length)
         if cycle_iteration == 0:
@@ -268,15 +265,11 @@ def train(config: MLSHConfig, make_envs: MakeEnvs, log: RunLog, seed: int, check
         end = time.perf_counter()
 
         metrics = {
-            "iteration": iteration,
-            "env_steps": (iteration + 1) * steps.num_steps,
-            **steps.statistics(),
             "cycle": cycle,
             "joint": int(joint),
             **{"skill_approx_kl": 0.0, "skill_clip_fraction": 0.0} | losses,  # warm-up leaves the skills alone
             **{f"{kind}_explained_variance": value for kind, value in sorted(estimate.explained_variance.items())},
             **statistics,
         }
-        log.row(metrics, steps.timing(start, collected, end))
-        checkpoint.record(iteration, **parts)
+        training.record(iteration, steps, (start, collected, end), metrics)
     envs.close()

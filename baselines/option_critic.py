@@ -25,12 +25,11 @@ from hippo.core.options import Acting, Execution, OptionPolicy, Options
 from hippo.core.policies import POLICY_HEAD
 from hippo.core.ppo import Level, Rows, clipped_surrogate, in_chunks, surrogate_statistics
 from hippo.core.skills import start_from
+from hippo.core.training import MakeEnvs, Training
 
 __all__ = ["Acting", "OptionCriticConfig", "restored", "train"]
 
 REVISION = 1  # bumped by every change that alters the metrics of tests/golden
-
-MakeEnvs = Callable[[int, str], Any]  # (num_envs, purpose) -> a vector environment that knows its robot_size
 
 
 def make_policy(config: OptionCriticConfig, envs: Any, generator: torch.Generator) -> OptionPolicy:
@@ -214,10 +213,9 @@ def train(config: OptionCriticConfig, make_envs: MakeEnvs, log: RunLog, seed: in
     start_from(config.skills, policy.skills, envs)
     optimizers = make_optimizers(config, policy)
     parts = {"policy": policy, **{f"{name}_optimizer": optimizer for name, optimizer in optimizers.items()}}
-    first = checkpoint.restore(**parts)
-    log.resume(first)
+    training = Training(log, checkpoint, parts)
 
-    for iteration in range(first, config.iterations):
+    for iteration in range(training.begin(), config.iterations):
         start, update_seconds = time.perf_counter(), 0.0
         run = Execution(policy, config, envs, seed, iteration)
         steps, generator = run.steps, seeding.torch_generator(seed, "minibatches", iteration)
@@ -236,12 +234,8 @@ def train(config: OptionCriticConfig, make_envs: MakeEnvs, log: RunLog, seed: in
         finished = time.perf_counter()
 
         metrics = {
-            "iteration": iteration,
-            "env_steps": (iteration + 1) * steps.num_steps,
-            **steps.statistics(),
             **{name: sum(u[name] for u in updates) / len(updates) for name in updates[0]},
             **option_statistics(run.options, config.num_skills),
         }
-        log.row(metrics, steps.timing(start, finished - update_seconds, finished))
-        checkpoint.record(iteration, **parts)
+        training.record(iteration, steps, (start, finished - update_seconds, finished), metrics)
     envs.close()

@@ -3,27 +3,18 @@
 import dataclasses
 from dataclasses import dataclass
 
-from hippo.core.settings import MOST_SKILLS, MOST_STEPS, WIDEST, ConfigError, check, setting
+from hippo.core.budget import BudgetConfig
+from hippo.core.settings import MOST_SKILLS, WIDEST, setting
 
 
 @dataclass
-class OptionCriticConfig:
+class OptionCriticConfig(BudgetConfig):
     """Every setting; the defaults are those that PPOC was published with, as the paper names none but the options.
 
     `code` names github.com/mklissa/PPOC.
     """
 
     iterations: int = setting(dataclasses.MISSING, "training iterations", code="488 of 2048 steps", low=1)
-    batch_size: int = setting(
-        dataclasses.MISSING,
-        "environment steps per iteration",
-        paper="Block 50 000, Gather 100 000 (App. A)",
-        low=1,
-        high=MOST_STEPS,
-    )
-    horizon: int = setting(
-        dataclasses.MISSING, "episode length H in steps", paper="Block 1000, Ant 5000, Snake 8000 (App. A)", low=1
-    )
     num_skills: int = setting(6, "number of options", paper="6 skills (App. A)", code="2", low=1, high=MOST_SKILLS)
     ppoc_faithful: bool = setting(
         False,
@@ -126,16 +117,6 @@ class OptionCriticConfig:
         high=WIDEST,
     )
     critic_hidden_sizes: list[int] = setting([64, 64], "hidden layers of the critic", code="2 x 64", low=1, high=WIDEST)
-
-    def __post_init__(self) -> None:
-        check(self)
-        if self.batch_size < self.horizon:
-            raise ConfigError("batch_size", self.batch_size, f"must be at least one horizon, {self.horizon} steps")
-
-    @property
-    def num_envs(self) -> int:
-        """Slots that collect one horizon each; ceil(batch / horizon)."""
-        return -(-self.batch_size // self.horizon)
 
     @property
     def scale(self) -> float:

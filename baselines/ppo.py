@@ -5,7 +5,6 @@ its episode, rewards are summed, and one step of the algorithm is one held actio
 """
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,11 +25,10 @@ from hippo.core.policies import GaussianPolicy, gaussian_entropy
 from hippo.core.ppo import Level, Rows
 from hippo.core.rollout import Steps
 from hippo.core.settings import WIDEST, ConfigError, setting
+from hippo.core.training import MakeEnvs, Training
 from hippo.core.value import ValueFunction, explained_variance
 
 REVISION = 1  # bumped by every change that alters the metrics of tests/golden
-
-MakeEnvs = Callable[[int, str], Any]  # (num_envs, purpose) -> a vector environment
 
 
 @dataclass
@@ -164,10 +162,9 @@ def train(config: PPOConfig, make_envs: MakeEnvs, log: RunLog, seed: int, checkp
     reward_scale = RewardScale() if config.scale_rewards else None
     if reward_scale is not None:
         parts["reward_scale"] = reward_scale
-    first = checkpoint.restore(**parts)
-    log.resume(first)
+    training = Training(log, checkpoint, parts)
 
-    for iteration in range(first, config.iterations):
+    for iteration in range(training.begin(), config.iterations):
         start = time.perf_counter()
         steps, is_decision = collect(policy, envs, config, seed, iteration)
         steps.check(iteration)
@@ -218,13 +215,9 @@ def train(config: PPOConfig, make_envs: MakeEnvs, log: RunLog, seed: int, checkp
         end = time.perf_counter()
 
         metrics = {
-            "iteration": iteration,
-            "env_steps": (iteration + 1) * steps.num_steps,
-            **steps.statistics(),
             **losses,
             "explained_variance": explained,
             **statistics,
         }
-        log.row(metrics, steps.timing(start, collected, end))
-        checkpoint.record(iteration, **parts)
+        training.record(iteration, steps, (start, collected, end), metrics)
     envs.close()

@@ -10,7 +10,7 @@ the authors' copy of it. Departure, *ours*: HiPPO's clipped surrogate and baseli
 docs/algorithms/snn.md has the whole list.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,12 +23,11 @@ from hippo.core.log import RunLog
 from hippo.core.policies import SkillPolicy
 from hippo.core.pretraining import Paths, PretrainingConfig, train_skills, trained_skills
 from hippo.core.settings import setting
+from hippo.core.training import MakeEnvs
 
 __all__ = ["SNNConfig", "skills", "train"]
 
 REVISION = 1  # bumped by every change that alters the metrics of tests/golden
-
-MakeEnvs = Callable[[int, str], Any]  # (num_envs, purpose) -> a vector environment that knows its robot_size
 
 
 @dataclass(frozen=True)

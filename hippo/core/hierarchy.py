@@ -326,11 +326,15 @@ def collect(
     return Batch(steps, torch.from_numpy(skill), torch.from_numpy(time_left), decisions, used)
 
 
+def new_policy(config: HierarchyConfig, envs: Any, generator: torch.Generator) -> HierarchicalPolicy:
+    """Freshly drawn networks for these environments."""
+    obs_size, action_size = envs.single_observation_space.shape[0], envs.single_action_space.shape[0]
+    return HierarchicalPolicy(config, obs_size, envs.robot_size, action_size, generator)
+
+
 def restored(config: HierarchyConfig, envs: Any, checkpoint: Checkpoint) -> HierarchicalPolicy:
     """The policy of a checkpoint."""
-    obs_size, action_size = envs.single_observation_space.shape[0], envs.single_action_space.shape[0]
-    generator = seeding.torch_generator(0, "overwritten by the checkpoint")
-    policy = HierarchicalPolicy(config, obs_size, envs.robot_size, action_size, generator)
+    policy = new_policy(config, envs, seeding.torch_generator(0, "overwritten by the checkpoint"))
     checkpoint.restore(policy=policy)
     return policy
 
