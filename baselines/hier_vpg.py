@@ -6,7 +6,12 @@ The ablation of HiPPO without its trust region: one full-batch step per iteratio
 
 At the policy that collected the batch this is the gradient of HiPPO's surrogate; the two differ in that HiPPO goes on
 for more steps on the same batch, held back by clipping, and in the step size. Re-implemented from the formula: the
-authors' script (hierarchical_vpg.py) does not run as published.
+authors' script (hierarchical_vpg.py) does not run as published. Where to find what:
+
+    trajectories by Algorithm 1                    hippo/core/hierarchy.py   collect
+    A_k, A_t and their baselines (section 4.2)     hippo/core/advantages.py  advantages
+    log pi_h, log pi_l (equation 4)                hippo/core/levels.py      levels
+    theta <- theta + alpha g                       here                      policy_gradient_step
 """
 
 import time

@@ -11,6 +11,18 @@ the actions of its c steps most likely to the present lower level (off-policy co
     argmax over g~ of  - sum_i | a_{t+i} - mu_low(s_{t+i}, S(s_t) + g~ - S(s_{t+i})) |^2
 
 Source: tensorflow/models, research/efficient-hrl at 052361de. docs/algorithms/hiro.md lists what differs.
+The paper has no box; its sections, line by line:
+
+    3.1 the manager sets g every c steps           hiro_levels.py            Agents.new_goal, Walk.step
+        else g' = h(s, g, s')                      hippo/core/goals.py       Goals.transition
+        the lower level acts on (s, g)             hiro_levels.py            Agents.act
+    3.2 intrinsic reward r(s, g, a, s')            hippo/core/goals.py       Goals.reward
+        transitions of both levels are stored      hippo/core/goals.py       Memory.add
+        both levels are trained                    here                      Learner.catch_up
+          by TD3                                   hippo/core/td3.py         TD3.update
+    3.3 candidates: g, s' - s, 8 around it         hippo/core/goals.py       candidate_goals
+        the most likely one relabels (equation 5)  hiro_levels.py            Agents.relabel
+    from given skills (ours)                       hiro_cloning.py           skill_rollouts, clone
 """
 
 import time

@@ -3,7 +3,18 @@
 The hierarchy is HiPPO's with a fixed period; what differs is the schedule. Time runs in cycles. A cycle has one
 environment configuration (object positions, wall heights) and starts with a new master (manager); for its first
 iterations only the master learns, then master and sub-policies (skills) learn together. docs/algorithms/mlsh.md lists
-what differs from the published code.
+what differs from the published code. Algorithm 1 of Frans et al., line by line:
+
+    initialise phi                                 here                      train, start_from
+    repeat: sample a task                          here                      train, layout_seed of a cycle
+      initialise theta                             here                      start_cycle
+      warm-up: for w = 0 .. W                      here                      train, joint = False
+        collect D by pi_phi,theta                  hippo/core/hierarchy.py   collect
+        update theta to maximise the return        here                      macro_advantages, optimize
+          seen at 1/N of the time scale
+      joint: for u = 0 .. U                        here                      train, joint = True
+        collect D, update theta, then phi          here                      levels, optimize
+          as above; phi seen at every step         hippo/core/advantages.py  advantages
 """
 
 import dataclasses

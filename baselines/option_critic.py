@@ -3,6 +3,17 @@
 Options are learnt end to end by four losses: intra-option PPO, a regression of Q(s, o), and the gradients of the
 terminations and of the policy over options. By default the latter two are the option-critic's; `ppoc_faithful` has the
 losses of PPOC's published code instead. docs/algorithms/option_critic.md derives them and lists all differences.
+Algorithm 1 of Bacon et al., line by line:
+
+    choose o by the policy over options            hippo/core/options.py                  Acting.decide
+    choose a by pi(a|s, o), take it                hippo/core/options.py                  Acting.action, Execution.run
+    1. options evaluation: the target of Q         option_critic_advantages.py            arrival_value, portion
+       and a step of Q towards it                  here                                   improve, critic_loss
+    2. options improvement: pi(a|s, o)             here, clipped as PPO's                 improve, level
+       beta(s', o)                                 here                                   termination_loss, stop_loss
+       policy over options (greedy there)          here, by its gradient                  improve, choice_loss
+    if beta terminates in s', choose a new o       hippo/core/options.py                  Acting.decide
+    the losses as PPOC has them                    ppoc.py                                improve_as_ppoc
 """
 
 import time

@@ -2,6 +2,14 @@
 
 One Gaussian policy sees the whole observation. With `action_repeat` p an action is held for p steps or to the end of
 its episode, rewards are summed, and one step of the algorithm is one held action, as in the authors' wrapper.
+Algorithm 1 of Schulman et al., line by line:
+
+    run pi_old in N environments for T steps       here                      collect, Acting
+    compute advantage estimates (equation 11)      hippo/core/gae.py         segment_gae
+    optimise L wrt theta, K epochs (equation 7)    hippo/core/ppo.py         clipped_surrogate, maximize
+      in minibatches of size M <= NT (modern)      hippo/core/on_policy.py   SurrogateConfig, improve
+      the value function's loss                    hippo/core/value.py       ValueFunction.fit
+    theta_old <- theta                             here                      the next round of train
 """
 
 import time

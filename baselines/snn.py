@@ -7,7 +7,14 @@ step earns, beside the environment's reward,
 
 whose first term averages to I(z; c) - H(z). Sources: SNN = github.com/florensacc/snn4hrl (grid_bonus_evaluator.py) and
 the authors' copy of it. Departure, *ours*: HiPPO's clipped surrogate and baseline instead of TRPO and a linear one.
-docs/algorithms/snn.md has the whole list.
+docs/algorithms/snn.md has the whole list. Algorithm 1 of SNN4HRL, line by line:
+
+    initialise the policy; a latent z of K skills  hippo/core/pretraining.py new_policy
+    z ~ Cat(1/K), kept for the whole path          hippo/core/pretraining.py collect
+    collect rollouts, count (c, z)                 here                      GridBonus.positions, cells
+    p(Z = z|c) from the counts                     here                      log_shares
+    R <- R + alpha log p(Z = z|c)                  here                      GridBonus.reward
+    a policy step (TRPO there)                     hippo/core/pretraining.py update
 """
 
 from collections.abc import Sequence

@@ -6,13 +6,17 @@ A manager pi_h(z|s) commits to a skill z for p steps; the skill pi_l(a|s, z) act
 
 where k runs over the manager's decisions and t over environment steps. Where to find what:
 
-    Algorithm 1, HiPPO Rollout; the commitment     hippo/core/hierarchy.py   collect, Commitment
+    Algorithm 1, HiPPO Rollout                     hippo/core/hierarchy.py   collect
+      lines 4, 5: draw p, then z ~ pi_h                                      Commitment.renew, Acting.decide
+      lines 6 to 9: a ~ pi_l for p steps                                     Acting.action, Commitment.advance
     settings of the hierarchy (n, p, networks)     hippo/core/hierarchy.py   HierarchyConfig
-    advantages and both baselines (section 4.2)    hippo/core/advantages.py  advantages
-    the clipped surrogate L^CLIP                   hippo/core/ppo.py         clipped_surrogate, maximize
-    minibatches, running statistics (modern)       hippo/core/on_policy.py   SurrogateConfig, improve
-    Lemma 1: exact and approximate gradient        hippo/gradients.py
     Algorithm 2, HiPPO                             here                      train
+      line 4: N trajectories                       hippo/core/hierarchy.py   collect
+      line 5: advantages of both levels (4.2)      hippo/core/advantages.py  advantages
+      line 7: the two terms of equation 4          hippo/core/levels.py      levels
+              clipped, L^CLIP, ascended            hippo/core/ppo.py         clipped_surrogate, maximize
+              in minibatches (modern)              hippo/core/on_policy.py   SurrogateConfig, improve
+    Lemma 1: exact and approximate gradient        hippo/gradients.py
 """
 
 import time

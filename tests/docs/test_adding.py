@@ -17,17 +17,19 @@ COPIED = (
     "hippo",
     "paper_figures",
     "docs",
+    "tests",
     "requirements.lock",
     "pyproject.toml",
 )
 
 
 def insert(text, block, name):
-    """`text` with the + lines of `block` after the line above them, which must be there once."""
-    context, *added = block.splitlines()
-    line = context[1:]
+    """`text` with the + lines of `block` after the line above them, which must be there once; a - line goes."""
+    first, *added = block.splitlines()
+    line = first[1:]
     assert text.splitlines().count(line) == 1, f"{name}: not there once: {line}"
-    new = "\n".join([line, *(a.removeprefix("+") for a in added)])
+    kept = [] if first.startswith("-") else [line]
+    new = "\n".join([*kept, *(a.removeprefix("+") for a in added)])
     return text.replace(f"{line}\n", f"{new}\n", 1)
 
 
@@ -90,3 +92,23 @@ def test_the_code_on_the_page_is_as_clean_as_the_projects(project):
         command = [sys.executable, "-m", "ruff", *check, *files]
         done = subprocess.run(command, cwd=root, capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stdout
+
+
+def test_of_a_changed_equation_4_the_tests_notice_that_the_page_names(project):
+    root, said = project
+    named = ["tests/hippo/test_hierarchy.py", "tests/hippo/test_golden.py"]
+    only = "levels_hold or (stored_ones and (hier_vpg or option_critic) and not modern)"
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *named, "-k", only]
+    environment = {key: text for key, text in os.environ.items() if not key.startswith("PYTEST")}
+    done = subprocess.run(
+        command, cwd=root, env=environment | {"PYTHONPATH": str(root)}, capture_output=True, text=True
+    )
+    noticed = {line.split("::")[1].split(" ")[0] for line in done.stdout.splitlines() if line.startswith("FAILED")}
+    assert noticed == {
+        "test_levels_hold_what_was_done_and_how_likely_it_was",
+        "test_a_learners_numbers_are_the_stored_ones_of_its_revision[hier_vpg]",
+    }, done.stdout
+    assert "passed" in done.stdout
+    states = [line.split()[2:5] for line in said.splitlines() if "0/120" in line]
+    assert {state for variant, _, state in states if variant.startswith("hippo")} == {"missing"}
+    assert {state for variant, _, state in states if variant.startswith("ppo")} == {"committed"}
