@@ -344,9 +344,3 @@ def in_whole_periods(is_decision: Tensor, period: int) -> Tensor:
     segment = is_decision.long().cumsum(0) - 1
     length = torch.zeros_like(segment).scatter_add_(0, segment, torch.ones_like(segment))
     return length.gather(0, segment) == period
-
-
-def rows_by_skill(batch: Batch) -> Tensor:
-    """Which of the flattened (T N) steps are learnt from, sorted by skill as the skill network wants."""
-    used = batch.used.flatten().nonzero().squeeze(-1)
-    return used[batch.skill[:-1].flatten()[used].argsort(stable=True)]

@@ -6,9 +6,15 @@ import torch
 from torch import Tensor
 
 from hippo.core.direct import Categorical, Gaussian, network_of
-from hippo.core.hierarchy import Batch, HierarchicalPolicy, rows_by_skill
+from hippo.core.hierarchy import Batch, HierarchicalPolicy
 from hippo.core.policies import gaussian_entropy
 from hippo.core.ppo import Level, Rows
+
+
+def rows_by_skill(batch: Batch) -> Tensor:
+    """Which of the flattened (T N) steps are learnt from, sorted by skill as the skill network wants."""
+    used = batch.used.flatten().nonzero().squeeze(-1)
+    return used[batch.skill[:-1].flatten()[used].argsort(stable=True)]
 
 
 def levels(

@@ -10,6 +10,7 @@ import pytest
 
 from tests.docs.pages import ROOT, blocks
 
+pytestmark = pytest.mark.timeout(600)  # the page trains nine runs, and the machine may be busy
 COPIED = (
     "analysis",
     "baselines",

@@ -15,8 +15,8 @@ from hippo.core import seeding
 from hippo.core.acting import rollout
 from hippo.core.advantages import Baselines, advantages
 from hippo.core.checkpoint import Checkpoint, CheckpointError, load, save
-from hippo.core.hierarchy import HierarchicalPolicy, collect, restored, rows_by_skill
-from hippo.core.levels import levels
+from hippo.core.hierarchy import HierarchicalPolicy, collect, restored
+from hippo.core.levels import levels, rows_by_skill
 from hippo.core.minibatch import minibatches
 from hippo.core.networks import SkillLinear, mlp, normalize_columns
 from hippo.core.normalize import ObservationFilter, RewardScale, RunningMoments
