@@ -65,9 +65,9 @@ report: draw-all claims  ## one page with everything that is there at SCALE; tra
 	@$(PY) analysis.report $(DRAW_FLAGS)
 
 skills-gallery: install  ## measure and draw the given skills, and a short video of each where OpenGL works
-	@$(PY) experiments.gallery paper_figures/data/skills/*.pt
+	@$(PY) experiments.artefacts.gallery paper_figures/data/skills/*.pt
 	@$(PY) paper_figures.gallery
-	@$(PY) experiments.gallery paper_figures/data/skills/*.pt --videos paper_figures/out/gallery || [ $$? -eq 1 ]  # no OpenGL
+	@$(PY) experiments.artefacts.gallery paper_figures/data/skills/*.pt --videos paper_figures/out/gallery || [ $$? -eq 1 ]  # no OpenGL
 
 claims: plans  ## the paper's comparative sentences and what the results at SCALE say about them
 	@$(PY) analysis.claims $(DRAW_FLAGS)
@@ -98,8 +98,13 @@ lint: install  ## ruff (format and rules) and mypy
 
 FAST_TESTS = -m "not slow and not slurm and not browser" --numprocesses logical --maxprocesses 4 --dist loadfile
 
-test: install  ## every test but the slow ones
-	$(PY) pytest $(FAST_TESTS)
+# Of those in folders of their own; tests/slurm and tests/report have targets below.
+TEST_GROUPS := $(filter-out slurm report,$(patsubst tests/%/__init__.py,%,$(wildcard tests/*/__init__.py)))
+not_a_group = $(filter-out $(TEST_GROUPS),$(value ONLY))
+
+test: install  ## every test but the slow ones; ONLY=envs or ONLY="hippo baselines" runs groups of tests/
+	$(if $(not_a_group),$(error ONLY=$(not_a_group) is no group of tests; choose from: $(TEST_GROUPS)))
+	$(PY) pytest $(FAST_TESTS) $(ONLY:%=tests/%)
 
 coverage: install  ## the lines of each package, in per cent, that `make test` runs, in processes of their own too
 	$(PY) pytest $(FAST_TESTS) --cov --cov-report=term
@@ -123,7 +128,7 @@ bench: install  ## speeds as ratios within one run, 25 minutes; QUICK=1, ONLY="p
 	@$(PY) experiments.bench $(if $(QUICK),--quick) $(if $(ONLY),--only $(foreach part,$(ONLY),$(call q,$(part)))) $(if $(WRITE),--write)
 
 profile: install  ## a flame graph of one HiPPO iteration on Ant Gather, docs/pictures/profile_ant_gather.svg
-	@$(PY) experiments.bench_flame
+	@$(PY) experiments.bench.flame
 
 install-render:  ## what off-screen drawing needs, by apt (as root)
 	apt-get update -qq && apt-get install -y -qq --no-install-recommends libegl1 libgl1-mesa-dri

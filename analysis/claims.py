@@ -14,13 +14,12 @@ import numpy as np
 import yaml
 
 from analysis import verdicts
-from analysis.command_line import parser
+from analysis.command_line import ROOT, bad_input, parser
 from analysis.edition import PAPER, chosen
 from analysis.predicates import KINDS, Kind, Pairs, Printed, Spec
 from analysis.runs import MissingData, Results, load
 from analysis.verdicts import FEWEST_SEEDS, INCONCLUSIVE, NOT_REPRODUCED, REPRODUCED, UNDECIDABLE, Ruling
 
-ROOT = Path(__file__).parent.parent
 NO_DATA, SMOKE = "no data", "smoke: no verdicts"
 NO_RUN = "by the sizes printed, no run needed"
 MOST_PLACES = 4  # that are named in a table's cell
@@ -177,8 +176,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         text = "\n".join(lines(options.scale, options.runs_dir, options.data, options.protocol)) + "\n"
     except ValueError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+        return bad_input(error)
     path = options.out / chosen(options).folder / "claims.md"
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(text)

@@ -1,10 +1,12 @@
 """The command line of everything that reads the results of one scale and protocol, here and in paper_figures."""
 
 import argparse
+import sys
 from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
 SCALES, PROTOCOLS = ("smoke", "laptop", "paper"), ("paper", "modern")
+BAD_INPUT = 2  # exit code
 
 
 def parser(prog: str, description: str) -> argparse.ArgumentParser:
@@ -16,3 +18,9 @@ def parser(prog: str, description: str) -> argparse.ArgumentParser:
     made.add_argument("--data", type=Path, default=ROOT / "paper_figures" / "data", help="committed results")
     made.add_argument("--out", type=Path, default=ROOT / "paper_figures" / "out")
     return made
+
+
+def bad_input(error: Exception) -> int:
+    """Say on stderr what was refused; the exit code."""
+    print(f"error: {error}", file=sys.stderr)
+    return BAD_INPUT

@@ -17,9 +17,10 @@ from urllib.parse import quote
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup, escape
 
-from analysis.command_line import parser
+from analysis.command_line import bad_input, parser
 from analysis.edition import chosen
-from analysis.report_data import Artefact, Report, RunFacts, Table, gather
+from analysis.report_data import Artefact, Report, Table, gather
+from analysis.report_runs import RunFacts
 from analysis.runs import MissingData
 
 HERE = Path(__file__).parent
@@ -194,8 +195,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         report = gather(chosen(options), options.runs_dir, options.data, options.out)
         pages = render(report)
     except (MissingData, ValueError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+        return bad_input(error)
     folder = options.out / chosen(options).folder
     folder.mkdir(parents=True, exist_ok=True)
     for line in report.not_drawn:

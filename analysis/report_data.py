@@ -2,27 +2,25 @@
 
 import csv
 import dataclasses
-import json
 import re
 from collections import Counter
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from PIL import Image
 
 from analysis import explain
+from analysis.command_line import ROOT
 from analysis.edition import OVERRIDDEN, Edition
-from analysis.runs import MissingData, check_edition, check_figure, code_of, stretches
+from analysis.report_runs import RunFacts, read_json, read_runs
+from analysis.runs import MissingData, check_edition, check_figure
 
-ROOT = Path(__file__).parent.parent
 LEDGER = ROOT / "docs" / "hyperparameters.csv"
 OWN_FILES = ("claims", "report")  # Markdown files of a scale's folder that are no tables
-VIDEOS = {".mp4": "video/mp4", ".gif": "image/gif"}
 STATING = (".pdf", ".svg", ".png", ".tex")  # files that state the runs behind them
 THERE = ("finished", "committed")
-NOT_HERE = "not trained here"  # a run that others start from; committed skills may stand in for it
 
 
 @dataclass(frozen=True)
@@ -37,27 +35,6 @@ class Table:
         number = re.compile(r"(\*\*)?[-+]?[\d,]*\.?\d+(e[-+]?\d+)?($|[ *])")
         columns = [[row[i] for row in self.rows if i < len(row) and row[i]] for i in range(len(self.header))]
         return [bool(cells) and all(number.match(cell) for cell in cells) for cells in columns]
-
-
-@dataclass
-class RunFacts:
-    """One run of this scale: what it is, how it is doing, where it came from, what it cost."""
-
-    run_id: str
-    algo: str = ""
-    env: str = ""
-    labels: list[str] = field(default_factory=list)  # what figures call it
-    seed: str = ""
-    physics: str = ""
-    state: str = "missing"
-    used_in: list[str] = field(default_factory=list)
-    commit: str = ""
-    dirty: bool | None = None  # None: no manifest here
-    code: list[str] = field(default_factory=list)  # `code_of` each stretch of a run that was interrupted
-    lock: str = ""
-    cpu: str = ""
-    seconds: float | None = None  # core-seconds, a run has one thread; None: it has no clocks here
-    videos: list[Path] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -141,21 +118,6 @@ def markdown_table(text: str) -> Table | None:
     return Table(header, rows)
 
 
-def read_json(path: Path) -> dict[str, Any]:
-    """An object in JSON.
-
-    Raises:
-        ValueError: it is none, with the file's name.
-    """
-    try:
-        content = json.loads(path.read_text())
-    except ValueError as error:
-        raise ValueError(f"{path}: is no JSON ({error})") from error
-    if not isinstance(content, dict):
-        raise ValueError(f"{path}: must hold a JSON object")
-    return content
-
-
 def read_plans(plans_dir: Path, edition: Edition) -> dict[str, dict[str, Any]]:
     """Plans of one edition, by figure.
 
@@ -172,59 +134,6 @@ def read_plans(plans_dir: Path, edition: Edition) -> dict[str, dict[str, Any]]:
         check_figure(path, plan)
         plans[path.stem] = plan
     return plans
-
-
-def core_seconds(path: Path) -> float | None:
-    """Sum of timing.csv's seconds, None without the file; a last line torn by a kill does not count."""
-    if not path.exists():
-        return None
-    text = path.read_text()
-    return sum(float(row["seconds"]) for row in csv.DictReader(text[: text.rfind("\n") + 1].splitlines()))
-
-
-def is_own(path: Path) -> bool:
-    """Whether a file lies in its folder itself: what a link leads to is not read."""
-    return path.is_file() and not path.is_symlink()
-
-
-def read_folder(facts: RunFacts, runs_dir: Path) -> None:
-    """Add what the run's folder says; without a folder nothing is added."""
-    folder = runs_dir / facts.run_id
-    if folder.name != facts.run_id or not folder.is_dir():  # an id with a slash in it is no folder of runs_dir
-        return
-    if facts.state != "committed" and (folder / "status.json").exists():
-        facts.state = str(read_json(folder / "status.json").get("state", "unknown"))
-    if (folder / "manifest.json").exists():
-        content = read_json(folder / "manifest.json")
-        identity = content.get("identity", {})
-        facts.algo = str(identity.get("algo", ""))
-        facts.env, facts.seed = facts.env or str(identity.get("env", "")), facts.seed or str(identity.get("seed", ""))
-        facts.commit, facts.lock = str(content.get("git_commit") or ""), str(content.get("lock") or "")
-        facts.dirty, facts.cpu = bool(content.get("git_difference")), str(content.get("cpu") or "")
-        facts.code = list(dict.fromkeys(map(code_of, stretches(content))))
-    facts.seconds = core_seconds(folder / "timing.csv")
-    facts.videos = sorted(path for path in folder.iterdir() if path.suffix in VIDEOS and is_own(path))
-
-
-def read_runs(plans: dict[str, dict[str, Any]], runs_dir: Path) -> list[RunFacts]:
-    """Each planned run once, in the plans' order, with the runs whose skills or policies it starts from before it."""
-    runs: dict[str, RunFacts] = {}
-    for figure, plan in plans.items():
-        for planned in plan["runs"]:
-            for ancestor in planned.get("ancestors", []):
-                facts = runs.setdefault(str(ancestor), RunFacts(str(ancestor), state=NOT_HERE))
-                facts.used_in += [figure] if figure not in facts.used_in else []
-            facts = runs.setdefault(str(planned["run_id"]), RunFacts(str(planned["run_id"])))
-            label = str(planned.get("variant_label", ""))
-            facts.labels += [label] if label not in facts.labels else []
-            facts.used_in += [figure] if figure not in facts.used_in else []
-            facts.env, facts.seed = str(planned.get("env_label", "")), str(planned.get("seed", ""))
-            facts.physics = str(planned.get("physics", ""))
-            # A run that one figure takes from the committed rows may be trained for another.
-            facts.state = facts.state if facts.state == "committed" else str(planned.get("state", "missing"))
-    for facts in runs.values():
-        read_folder(facts, runs_dir)
-    return list(runs.values())
 
 
 def absent(plan: dict[str, Any], states: dict[str, str]) -> list[str]:

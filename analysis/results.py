@@ -15,12 +15,11 @@ import numpy as np
 
 from analysis import stats
 from analysis.claims import CLAIMS, in_words, paper_values, ruled, tally, verdict_of
-from analysis.command_line import PROTOCOLS
+from analysis.command_line import PROTOCOLS, ROOT, bad_input
 from analysis.edition import PAPER, Edition
 from analysis.runs import MissingData, Results, load, scores
 from analysis.verdicts import NOT_REPRODUCED, REPRODUCED, Ruling
 
-ROOT = Path(__file__).parent.parent
 DATA = ROOT / "paper_figures" / "data"
 CALIBRATION = ROOT / "docs" / "environments" / "calibration.md"
 SCALES = ("laptop", "paper")  # the larger one last
@@ -230,8 +229,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         text, summary = pages(load_all(options.runs_dir, options.data), options.docs / "pictures")
     except ValueError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+        return bad_input(error)
     (options.docs / "results.md").write_text(text)
     options.readme.write_text(MARK.sub(lambda m: f"{m[1]}{summary}{m[2]}", options.readme.read_text()))
     print(f"wrote {options.docs / 'results.md'} and the verdicts of {options.readme}")

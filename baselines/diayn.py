@@ -7,10 +7,18 @@ A discriminator q(z|s) learns which skill led to a state; a step of skill z that
 the last term being the sample of the entropy that the method maximises beside. Departures, *ours*: on-policy, with
 HiPPO's network and clipped surrogate instead of SAC, so that the skills load as they are; absolute x is hidden from the
 discriminator, which would otherwise only have to measure distance. docs/algorithms/diayn.md has the whole list.
+Algorithm 1 of Eysenbach et al., line by line:
+
+    sample z ~ p(z), kept for the whole path       hippo/core/pretraining.py collect
+    sample a ~ pi(a|s, z), step the environment    hippo/core/pretraining.py collect
+    compute q(z|s') with the discriminator         here                      Discriminator.log_probs
+    r = log q(z|s') - log p(z)                     here                      skill_reward
+    update the policy to maximise r (SAC there)    hippo/core/pretraining.py update
+    update the discriminator                       here                      Distinguishable.learn, Discriminator.fit
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -28,13 +36,12 @@ from hippo.core.policies import SkillPolicy
 from hippo.core.ppo import in_chunks
 from hippo.core.pretraining import Paths, PretrainingConfig, train_skills, trained_skills
 from hippo.core.settings import WIDEST, setting
+from hippo.core.training import MakeEnvs
 
 __all__ = ["DIAYNConfig", "skills", "train"]
 
 REVISION = 1  # bumped by every change that alters the metrics of tests/golden
 ABSOLUTE = ("x", "y", "com_x", "com_y")  # entries that grow with the distance travelled
-
-MakeEnvs = Callable[[int, str], Any]  # (num_envs, purpose) -> a vector environment that knows its robot_size
 
 
 @dataclass

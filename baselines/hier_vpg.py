@@ -6,13 +6,17 @@ The ablation of HiPPO without its trust region: one full-batch step per iteratio
 
 At the policy that collected the batch this is the gradient of HiPPO's surrogate; the two differ in that HiPPO goes on
 for more steps on the same batch, held back by clipping, and in the step size. Re-implemented from the formula: the
-authors' script (hierarchical_vpg.py) does not run as published.
+authors' script (hierarchical_vpg.py) does not run as published. Where to find what:
+
+    trajectories by Algorithm 1                    hippo/core/hierarchy.py   collect
+    A_k, A_t and their baselines (section 4.2)     hippo/core/advantages.py  advantages
+    log pi_h, log pi_l (equation 4)                hippo/core/levels.py      levels
+    theta <- theta + alpha g                       here                      policy_gradient_step
 """
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import nn
@@ -20,26 +24,18 @@ from torch import nn
 from hippo.core import seeding
 from hippo.core.advantages import Baselines, advantages
 from hippo.core.checkpoint import Checkpoint
-from hippo.core.hierarchy import (
-    Acting,
-    HierarchicalPolicy,
-    HierarchyConfig,
-    collect,
-    levels,
-    policy_statistics,
-    restored,
-)
+from hippo.core.hierarchy import Acting, HierarchyConfig, collect, new_policy, restored
+from hippo.core.levels import levels, policy_statistics
 from hippo.core.log import RunLog, check_finite
 from hippo.core.optimizers import Adam
 from hippo.core.ppo import Level, chunks
 from hippo.core.settings import setting
 from hippo.core.skills import start_from
+from hippo.core.training import MakeEnvs, Training
 
 __all__ = ["Acting", "HierVPGConfig", "restored", "train"]
 
 REVISION = 1  # bumped by every change that alters the metrics of tests/golden
-
-MakeEnvs = Callable[[int, str], Any]  # (num_envs, purpose) -> a vector environment that knows its robot_size
 
 
 @dataclass
@@ -71,18 +67,16 @@ def train(config: HierVPGConfig, make_envs: MakeEnvs, log: RunLog, seed: int, ch
         Diverged: an observation, a reward or a parameter is no longer finite.
     """
     envs = make_envs(config.num_envs, "training")
-    obs_size, action_size = envs.single_observation_space.shape[0], envs.single_action_space.shape[0]
-    generator = seeding.torch_generator(seed, "initialisation")
-    policy = HierarchicalPolicy(config, obs_size, envs.robot_size, action_size, generator)
+    obs_size, generator = envs.single_observation_space.shape[0], seeding.torch_generator(seed, "initialisation")
+    policy = new_policy(config, envs, generator)
     start_from(config.skills, policy.skills, envs)
     baselines = Baselines(config, obs_size, generator)
     optimizer = Adam(policy.parameters(), lr=config.learning_rate)
 
     parts = {"policy": policy, "baselines": baselines, "optimizer": optimizer}
-    first = checkpoint.restore(**parts)
-    log.resume(first)
+    training = Training(log, checkpoint, parts)
 
-    for iteration in range(first, config.iterations):
+    for iteration in range(training.begin(), config.iterations):
         start = time.perf_counter()
         batch = collect(policy, envs, config, seed, iteration)
         steps = batch.steps
@@ -100,13 +94,9 @@ def train(config: HierVPGConfig, make_envs: MakeEnvs, log: RunLog, seed: int, ch
         end = time.perf_counter()
 
         metrics = {
-            "iteration": iteration,
-            "env_steps": (iteration + 1) * steps.num_steps,
-            **steps.statistics(),
             "objective": objective,
             **{f"{kind}_explained_variance": value for kind, value in estimate.explained_variance.items()},
             **statistics,
         }
-        log.row(metrics, steps.timing(start, collected, end))
-        checkpoint.record(iteration, **parts)
+        training.record(iteration, steps, (start, collected, end), metrics)
     envs.close()

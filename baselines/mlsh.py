@@ -3,14 +3,24 @@
 The hierarchy is HiPPO's with a fixed period; what differs is the schedule. Time runs in cycles. A cycle has one
 environment configuration (object positions, wall heights) and starts with a new master (manager); for its first
 iterations only the master learns, then master and sub-policies (skills) learn together. docs/algorithms/mlsh.md lists
-what differs from the published code.
+what differs from the published code. Algorithm 1 of Frans et al., line by line:
+
+    initialise phi                                 here                      train, start_from
+    repeat: sample a task                          here                      train, layout_seed of a cycle
+      initialise theta                             here                      start_cycle
+      warm-up: for w = 0 .. W                      here                      train, joint = False
+        collect D by pi_phi,theta                  hippo/core/hierarchy.py   collect
+        update theta to maximise the return        here                      macro_advantages, optimize
+          seen at 1/N of the time scale
+      joint: for u = 0 .. U                        here                      train, joint = True
+        collect D, update theta, then phi          here                      levels, optimize
+          as above; phi seen at every step         hippo/core/advantages.py  advantages
 """
 
 import dataclasses
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -20,16 +30,8 @@ from hippo.core import seeding
 from hippo.core.advantages import Advantages, Baselines, advantages, masked_standardize
 from hippo.core.checkpoint import Checkpoint
 from hippo.core.gae import segment_gae
-from hippo.core.hierarchy import (
-    Acting,
-    Batch,
-    HierarchicalPolicy,
-    HierarchyConfig,
-    collect,
-    levels,
-    policy_statistics,
-    restored,
-)
+from hippo.core.hierarchy import Acting, Batch, HierarchicalPolicy, HierarchyConfig, collect, restored
+from hippo.core.levels import levels, policy_statistics
 from hippo.core.log import RunLog, check_finite
 from hippo.core.minibatch import maximize_in_minibatches
 from hippo.core.optimizers import Adam
@@ -37,13 +39,12 @@ from hippo.core.policies import Manager
 from hippo.core.ppo import Level
 from hippo.core.settings import ConfigError, setting
 from hippo.core.skills import start_from
+from hippo.core.training import MakeEnvs, Training
 from hippo.core.value import ValueFunction, explained_variance
 
 __all__ = ["Acting", "MLSHConfig", "restored", "train"]
 
 REVISION = 1  # bumped by every change that alters the metrics of tests/golden
-
-MakeEnvs = Callable[[int, str], Any]  # (num_envs, purpose) -> a vector environment that knows its robot_size
 
 
 @dataclass
@@ -249,10 +250,9 @@ def train(config: MLSHConfig, make_envs: MakeEnvs, log: RunLog, seed: int, check
         "manager_optimizer": optimizers["manager"],
         "skill_optimizer": optimizers["skill"],
     }
-    first = checkpoint.restore(**parts)
-    log.resume(first)
+    training = Training(log, checkpoint, parts)
 
-    for iteration in range(first, config.iterations):
+    for iteration in range(training.begin(), config.iterations):
         start = time.perf_counter()
         cycle, cycle_iteration = divmod(iteration, config.cycle_length)
         if cycle_iteration == 0:
@@ -276,15 +276,11 @@ def train(config: MLSHConfig, make_envs: MakeEnvs, log: RunLog, seed: int, check
         end = time.perf_counter()
 
         metrics = {
-            "iteration": iteration,
-            "env_steps": (iteration + 1) * steps.num_steps,
-            **steps.statistics(),
             "cycle": cycle,
             "joint": int(joint),
             **{"skill_approx_kl": 0.0, "skill_clip_fraction": 0.0} | losses,  # warm-up leaves the skills alone
             **{f"{kind}_explained_variance": value for kind, value in sorted(estimate.explained_variance.items())},
             **statistics,
         }
-        log.row(metrics, steps.timing(start, collected, end))
-        checkpoint.record(iteration, **parts)
+        training.record(iteration, steps, (start, collected, end), metrics)
     envs.close()

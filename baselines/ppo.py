@@ -2,10 +2,17 @@
 
 One Gaussian policy sees the whole observation. With `action_repeat` p an action is held for p steps or to the end of
 its episode, rewards are summed, and one step of the algorithm is one held action, as in the authors' wrapper.
+Algorithm 1 of Schulman et al., line by line:
+
+    run pi_old in N environments for T steps       here                      collect, Acting
+    compute advantage estimates (equation 11)      hippo/core/gae.py         segment_gae
+    optimise L wrt theta, K epochs (equation 7)    hippo/core/ppo.py         clipped_surrogate, maximize
+      in minibatches of size M <= NT (modern)      hippo/core/on_policy.py   SurrogateConfig, improve
+      the value function's loss                    hippo/core/value.py       ValueFunction.fit
+    theta_old <- theta                             here                      the next round of train
 """
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,11 +33,10 @@ from hippo.core.policies import GaussianPolicy, gaussian_entropy
 from hippo.core.ppo import Level, Rows
 from hippo.core.rollout import Steps
 from hippo.core.settings import WIDEST, ConfigError, setting
+from hippo.core.training import MakeEnvs, Training
 from hippo.core.value import ValueFunction, explained_variance
 
 REVISION = 1  # bumped by every change that alters the metrics of tests/golden
-
-MakeEnvs = Callable[[int, str], Any]  # (num_envs, purpose) -> a vector environment
 
 
 @dataclass
@@ -164,10 +170,9 @@ def train(config: PPOConfig, make_envs: MakeEnvs, log: RunLog, seed: int, checkp
     reward_scale = RewardScale() if config.scale_rewards else None
     if reward_scale is not None:
         parts["reward_scale"] = reward_scale
-    first = checkpoint.restore(**parts)
-    log.resume(first)
+    training = Training(log, checkpoint, parts)
 
-    for iteration in range(first, config.iterations):
+    for iteration in range(training.begin(), config.iterations):
         start = time.perf_counter()
         steps, is_decision = collect(policy, envs, config, seed, iteration)
         steps.check(iteration)
@@ -218,13 +223,9 @@ def train(config: PPOConfig, make_envs: MakeEnvs, log: RunLog, seed: int, checkp
         end = time.perf_counter()
 
         metrics = {
-            "iteration": iteration,
-            "env_steps": (iteration + 1) * steps.num_steps,
-            **steps.statistics(),
             **losses,
             "explained_variance": explained,
             **statistics,
         }
-        log.row(metrics, steps.timing(start, collected, end))
-        checkpoint.record(iteration, **parts)
+        training.record(iteration, steps, (start, collected, end), metrics)
     envs.close()

@@ -7,10 +7,17 @@ step earns, beside the environment's reward,
 
 whose first term averages to I(z; c) - H(z). Sources: SNN = github.com/florensacc/snn4hrl (grid_bonus_evaluator.py) and
 the authors' copy of it. Departure, *ours*: HiPPO's clipped surrogate and baseline instead of TRPO and a linear one.
-docs/algorithms/snn.md has the whole list.
+docs/algorithms/snn.md has the whole list. Algorithm 1 of SNN4HRL, line by line:
+
+    initialise the policy; a latent z of K skills  hippo/core/pretraining.py new_policy
+    z ~ Cat(1/K), kept for the whole path          hippo/core/pretraining.py collect
+    collect rollouts, count (c, z)                 here                      GridBonus.positions, cells
+    p(Z = z|c) from the counts                     here                      log_shares
+    R <- R + alpha log p(Z = z|c)                  here                      GridBonus.reward
+    a policy step (TRPO there)                     hippo/core/pretraining.py update
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,12 +30,11 @@ from hippo.core.log import RunLog
 from hippo.core.policies import SkillPolicy
 from hippo.core.pretraining import Paths, PretrainingConfig, train_skills, trained_skills
 from hippo.core.settings import setting
+from hippo.core.training import MakeEnvs
 
 __all__ = ["SNNConfig", "skills", "train"]
 
 REVISION = 1  # bumped by every change that alters the metrics of tests/golden
-
-MakeEnvs = Callable[[int, str], Any]  # (num_envs, purpose) -> a vector environment that knows its robot_size
 
 
 @dataclass(frozen=True)

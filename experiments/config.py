@@ -1,15 +1,13 @@
 """One run's configuration: composed by Hydra from conf/ and overrides, validated, and named by its content."""
 
-import contextlib
 import dataclasses
-import difflib
 import functools
 import hashlib
 import json
 import operator
 import re
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -17,128 +15,45 @@ from typing import Any
 import yaml
 from hydra import compose, initialize_config_dir
 from hydra.core.config_store import ConfigStore
-from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Override
-from hydra.errors import HydraException
 from omegaconf import MISSING, DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 
-from experiments import synonyms
-from hippo.core.settings import ConfigError, setting
-from hippo.core.skills import SkillsError, read_skills
-from hippo.envs import ENVIRONMENTS, environment, foreign
-from hippo.envs.arguments import Refused
-from hippo.envs.foreign import ForeignOptions
-from hippo.envs.registration import Options, check_options
+from experiments.choices import COMMITTED, CONF, GROUPS, check_choice
+from experiments.refusals import (
+    as_config_error,
+    check_group,
+    check_key,
+    check_reward,
+    check_skills,
+    of_algo,
+    of_environment,
+    parsed,
+    unquoted,
+)
+from experiments.schema import (
+    BUDGET_FIELDS,
+    PRETRAINED,
+    PRETRAINING,
+    SHARED_WITH_SKILLS,
+    WANDB_MODES,
+    EnvConfig,
+    RunSchema,
+    WandbConfig,
+    default_of,
+    option_fields,
+)
+from hippo.core.settings import ConfigError
+from hippo.core.skills import read_skills
+from hippo.envs import environment, foreign
+from hippo.envs.registration import check_options
 from hippo.learners import LEARNERS, config_class, learner_of
 
-CONF = Path(__file__).parent / "conf"
-COMMITTED = Path(__file__).parent.parent / "paper_figures" / "data"
-# The groups of conf/ that a run chooses from, and what it chooses when nothing is said.
-GROUPS = {"env": "block_hopper", "algo": "hippo", "scale": "paper", "protocol": "paper"}
-BUDGET_FIELDS = ("iterations", "batch_size", "horizon")
 # Names and paths: the text after `key=` is taken as it is typed and never parsed, so it may hold any character.
 PLAIN_TEXT = ("runs_dir", "algo.skills", "algo.goal_space", "env.skill_view", "wandb.project")
-# Filled in from the run level, or descriptions that no override should touch.
-NOT_OVERRIDDEN = {
-    "budget",
-    "off_policy",
-    "protocol",
-    "seeds",
-    "scale",
-    "env.name",
-    "env.id",
-    "env.label",
-    "env.seconds_per_step",
-} | {f"algo.{name}" for name in BUDGET_FIELDS}
 KINDS = ("train", "pretrain", "evaluate", "measure")
 # Bumped when what hippo.gradients.measure, experiments.evaluate or an algorithm's `skills` makes of a run changes.
 KIND_REVISIONS = {"measure": 1, "evaluate": 1}
-PRETRAINING = {"ant": "snn", "snake": "snn", "hopper": "diayn", "half_cheetah": "diayn"}  # robot -> algorithm
-PRETRAINED = "pretrained"  # value of algo.skills: the skills that the robot's pre-training run makes
-SHARED_WITH_SKILLS = ("num_skills", "skill_hidden_sizes", "skill_integration", "log_std_per_skill")
-ONE_VALUE = "must be key=value with one value; several make a sweep: experiments.sweep run --name NAME --over key=a,b"
-WANDB_MODES = ("disabled", "offline", "online")
 
 installed = functools.cache(version)  # reading a package's metadata takes 3 ms, and a plan asks a thousand times
-
-
-@dataclass
-class EnvConfig(Options, ForeignOptions):
-    """An environment and its options."""
-
-    name: str = MISSING
-    id: str = ""  # of Gymnasium's registry, for name gym
-    label: str = MISSING
-    horizon: int = MISSING
-    seconds_per_step: float = MISSING
-
-
-@dataclass
-class Budget:
-    """What one environment gets at one scale."""
-
-    iterations: int = MISSING
-    batch_size: int = MISSING
-    horizon: int = MISSING
-    physics: str = MISSING
-
-
-@dataclass
-class OffPolicyBudget:
-    """What an off-policy learner (HIRO) gets at one scale, whatever the environment."""
-
-    iterations: int = MISSING
-    batch_size: int = MISSING
-
-
-@dataclass
-class Protocol:
-    """How all on-policy learners are set up: settings, budgets and seeds that differ from the defaults.
-
-    Off-policy HIRO has none of the settings; pre-training is the same under every protocol.
-    """
-
-    name: str = MISSING
-    label: str = MISSING
-    settings: dict[str, Any] = field(default_factory=dict)
-    learners: dict[str, dict[str, Any]] = field(default_factory=dict)
-    budget: dict[str, dict[str, dict[str, int]]] = field(default_factory=dict)  # scale -> environment
-    seeds: dict[str, int] = field(default_factory=dict)  # scale -> seeds of a figure
-
-
-@dataclass
-class WandbConfig:
-    """The mirror to Weights & Biases."""
-
-    mode: str = setting("disabled", "whether and how the run is mirrored (docs/wandb.md)", choices=WANDB_MODES)
-    project: str = setting("hippo", "where it is mirrored to")
-
-
-@dataclass
-class LogConfig:
-    """What a run leaves besides its own files."""
-
-    tensorboard: bool = setting(False, "whether it is mirrored to <run>/tensorboard, for TensorBoard (docs/wandb.md)")
-
-
-@dataclass
-class RunSchema:
-    """The root of a composed configuration."""
-
-    env: EnvConfig = MISSING
-    algo: Any = MISSING
-    scale: str = MISSING
-    seed: int = setting(MISSING, "root of every random stream; at least 0 and below 2**32")
-    seeds: int = MISSING
-    iterations: int = MISSING
-    batch_size: int = MISSING
-    runs_dir: str = setting(MISSING, "the folder in which the run makes its own")
-    budget: dict[str, Budget] = field(default_factory=dict)
-    off_policy: OffPolicyBudget = field(default_factory=OffPolicyBudget)
-    protocol: Protocol = field(default_factory=Protocol)
-    wandb: WandbConfig = field(default_factory=WandbConfig)
-    log: LogConfig = field(default_factory=LogConfig)
 
 
 @dataclass(frozen=True)
@@ -265,7 +180,7 @@ class Run:
         try:
             plain = yaml.safe_load(text)
             check_choice("algo", plain["algo"], tuple(LEARNERS))
-            _check_group("env", plain["env"])
+            check_group("env", plain["env"])
             check_choice("kind", plain["kind"], KINDS)
             for key, kind in {"seed": int, "options": dict, "config": dict, "scale": str}.items():
                 if not isinstance(plain[key], kind):
@@ -287,31 +202,6 @@ def committed_skills(run: Run) -> Path | None:
     """The committed skills file, if it is the one that the pre-training `run` would make."""
     path = COMMITTED / "skills" / f"{run.env}.pt"
     return path if run.kind == "pretrain" and path.exists() and read_skills(path)[0]["run_id"] == run.run_id else None
-
-
-def default_of(f: dataclasses.Field) -> Any:
-    """A dataclass field's default value, MISSING where it has none."""
-    return f.default_factory() if f.default_factory is not dataclasses.MISSING else f.default
-
-
-def choices(group: str) -> list[str]:
-    """The files of one group of conf/, e.g. the scales."""
-    return sorted(path.stem for path in (CONF / group).glob("*.yaml"))
-
-
-def nearest(value: str, valid: Sequence[str]) -> str:
-    """A hint at the valid choices, the closest one first if there is one; of many choices only the closest five."""
-    close = difflib.get_close_matches(value, valid, n=5, cutoff=0.6 if len(valid) <= 12 else 0.3)
-    suggestion = f"did you mean {close[0]}? " if close else ""
-    shown = list(valid) if len(valid) <= 12 else [*(close or valid[:5]), "..."]
-    return f"{suggestion}valid: {', '.join(shown)}"
-
-
-def check_choice(key: str, value: str, valid: Sequence[str]) -> str:
-    """`value`, or a ConfigError that names the valid ones."""
-    if value not in valid:
-        raise ConfigError(key, value, nearest(value, valid))
-    return value
 
 
 @functools.cache
@@ -372,138 +262,29 @@ def compose_run(overrides: Sequence[str], runs_dir: Path | None = None) -> Run:
         if key in PLAIN_TEXT:
             names[key] = unquoted(value)
         elif key in groups:
-            groups[key] = _check_group(key, str(_parsed(key, text).value()))
+            groups[key] = check_group(key, str(parsed(key, text).value()))
         else:
-            settings.append(_parsed(key, text))
+            settings.append(parsed(key, text))
     if runs_dir is not None:
         names["runs_dir"] = str(runs_dir)
-    _check_reward(groups["env"], groups["algo"])
+    check_reward(groups["env"], groups["algo"])
     config = _base(**groups).copy()
     for override in settings:
-        _check_key(config, override.key_or_group, override.value())
+        check_key(config, override.key_or_group, override.value())
         if override.value() == MISSING:
             raise ConfigError(override.key_or_group, MISSING, "must have a value")
-        with _as_config_error(override.key_or_group, override.value()):
+        with as_config_error(override.key_or_group, override.value()):
             of_any_name = override.key_or_group == "env.kwargs"
             OmegaConf.update(config, override.key_or_group, override.value(), force_add=of_any_name)
     for key, name in names.items():
-        _check_key(config, key, name)
+        check_key(config, key, name)
     return _validated(config, groups["algo"], names)
-
-
-def unquoted(text: str) -> str:
-    """`text` without one pair of quotes around it, which Hydra's grammar would ask for and a shell may leave."""
-    return text[1:-1] if len(text) > 1 and text[0] == text[-1] and text[0] in "'\"" else text
-
-
-def _parsed(key: str, text: str) -> Override:
-    value = text.partition("=")[2]
-    with _as_config_error(key, value):
-        (override,) = OverridesParser.create().parse_overrides([text])
-    if override.is_sweep_override() or override.is_add() or override.is_delete():
-        raise ConfigError(key, value, ONE_VALUE)
-    return override
-
-
-def group_choices(group: str) -> list[str]:
-    """The values of env, algo, scale or protocol."""
-    if group == "env":
-        return [name if name in ENVIRONMENTS else f"{foreign.PREFIX}<id>" for name in choices(group)]
-    return list(LEARNERS) if group == "algo" else choices(group)
-
-
-def _check_group(group: str, value: str) -> str:
-    if group == "env" and foreign.is_foreign(value):
-        with _of_environment():
-            environment(value)
-        return value
-    valid = group_choices(group)
-    meant = synonyms.environment(value, valid) if group == "env" and value not in valid else ""
-    if meant:
-        raise ConfigError(group, value, f"did you mean {meant}? valid: {', '.join(valid)}")
-    return check_choice(group, value, valid)
-
-
-def _check_reward(env: str, algo: str) -> None:
-    """Refuse to learn a task where there is none."""
-    if foreign.is_foreign(env) and algo in PRETRAINING.values():
-        raise ConfigError("algo", algo, f"makes skills of the robots here, {', '.join(PRETRAINING)}, not in {env}")
-    if not environment(env).pays and algo not in PRETRAINING.values():
-        tasks = [name for name, e in ENVIRONMENTS.items() if e.robot == ENVIRONMENTS[env].robot and e.pays]
-        there = f"the robot alone is paid nothing, algo={PRETRAINING[env]} brings its own reward"
-        raise ConfigError("env", env, f"{there}; did you mean {', '.join(tasks)}?")
-
-
-def _check_key(config: DictConfig, key: str, value: Any) -> None:
-    known = sorted(_keys(config))
-    if key not in known:
-        hint = synonyms.hint(key, [*known, *GROUPS])
-        raise ConfigError(key, value, hint or f"no such key; {nearest(key, known)}")
-
-
-def _keys(node: DictConfig, prefix: str = "") -> Iterator[str]:
-    for name in map(str, node):
-        key, child = f"{prefix}{name}", node._get_node(name)
-        if isinstance(child, DictConfig) and name not in ("budget", "off_policy", "protocol", "kwargs"):
-            yield from _keys(child, f"{key}.")
-        elif key not in NOT_OVERRIDDEN:
-            yield key
-
-
-@contextlib.contextmanager
-def _as_config_error(key: str, value: Any) -> Iterator[None]:
-    """Turn what Hydra and OmegaConf raise into one line about the key and the value."""
-    try:
-        yield
-    except (HydraException, OmegaConfBaseException) as error:
-        raise ConfigError(key, value, str(error).splitlines()[0]) from error
-
-
-@contextlib.contextmanager
-def _of_environment() -> Iterator[None]:
-    """Name what an environment refuses, itself or one of its options, by its key in the whole configuration."""
-    try:
-        yield
-    except Refused as error:
-        raise ConfigError("env" if error.key == "env" else f"env.{error.key}", error.value, error.valid) from error
-
-
-def option_fields() -> list[dataclasses.Field]:
-    """The fields of everything that an environment can be told."""
-    return [*dataclasses.fields(Options), *dataclasses.fields(ForeignOptions)]
-
-
-def level_of(name: str) -> str:
-    """Where a setting of an algorithm stands in the whole configuration."""
-    return {"iterations": "", "batch_size": "", "horizon": "env."}.get(name, "algo.")
-
-
-@contextlib.contextmanager
-def _of_algo() -> Iterator[None]:
-    """Name a setting that an algorithm refuses by its key in the whole configuration."""
-    try:
-        yield
-    except (ConfigError, Refused) as error:
-        raise ConfigError(f"{level_of(error.key)}{error.key}", error.value, error.valid) from error
-
-
-def _check_skills(path: str, env: dict[str, Any], settings: dict[str, Any]) -> None:
-    """Refuse a skills file that cannot be read, or is for another robot, observation or network."""
-    try:
-        metadata, _ = read_skills(Path(path))
-    except SkillsError as error:
-        raise ConfigError("algo.skills", path, f"must be {PRETRAINED} or a skills file ({error})") from error
-    wanted = {"robot": environment(env["name"]).robot, "observation": env["observation"]}
-    wanted |= {name.removeprefix("skill_"): settings[name] for name in SHARED_WITH_SKILLS if name in settings}
-    for key, value in wanted.items():
-        if metadata[key] != value:
-            raise ConfigError("algo.skills", path, f"has {key} {metadata[key]}, this run needs {value}")
 
 
 def _validated(config: DictConfig, algo: str, names: dict[str, str]) -> Run:
     if OmegaConf.is_missing(config.env, "horizon"):
         raise ConfigError("env.horizon", MISSING, f"must be given: {config.env.id} has no registered time limit")
-    with _as_config_error("config", algo):
+    with as_config_error("config", algo):
         plain: Any = OmegaConf.to_container(config, resolve=True)
     for key, value in names.items():  # here, where nothing is parsed or interpolated any more
         *groups, name = key.split(".")
@@ -511,20 +292,20 @@ def _validated(config: DictConfig, algo: str, names: dict[str, str]) -> Run:
     env: dict[str, Any] = plain["env"]
     if env["id"]:
         env["name"] = f"{foreign.PREFIX}{env['id']}"
-    with _of_algo():
+    with of_algo():
         settings = config_class(algo)(**plain["algo"])
     options = {f.name: env[f.name] for f in option_fields() if env[f.name] != default_of(f)}
-    with _of_environment():
+    with of_environment():
         check_options(env["name"], options)
     if hasattr(settings, "check_environment"):
         layout = foreign.layout_of(env["name"], options) if foreign.is_foreign(env["name"]) else None
-        with _of_algo():
+        with of_algo():
             settings.check_environment(environment(env["name"]).robot, options, layout)
     skills = plain["algo"].get("skills", "")
     if skills == PRETRAINED and foreign.is_foreign(env["name"]):
         raise ConfigError("algo.skills", skills, f"there are none for {env['name']}; valid: a skills file, or nothing")
     if skills not in ("", PRETRAINED):
-        _check_skills(skills, env, plain["algo"])
+        check_skills(skills, env, plain["algo"])
     check_choice("wandb.mode", plain["wandb"]["mode"], WANDB_MODES)
     if not plain["runs_dir"]:
         raise ConfigError("runs_dir", "", "must name a folder")

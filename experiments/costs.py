@@ -24,7 +24,7 @@ from hippo.core.files import DamagedFile, read_json
 from hippo.core.log import RunLog
 from hippo.learners import learner_of
 
-REFERENCE = Path(__file__).with_name("reference_costs.json")  # committed; experiments.cost_table --measure writes it
+REFERENCE = Path(__file__).with_name("reference_costs.json")  # experiments.artefacts.cost_table --measure writes it
 STEPS, ITERATIONS = 200, 3  # of the short training, per environment; its first iteration warms up and does not count
 
 

@@ -10,6 +10,7 @@ from hippo.envs.blocks import TUMBLED, Blocks
 from hippo.envs.vector import RobotTaskEnv
 
 COLUMNS = ("crossings", "crossings_tumbled", "crossings_height")
+CEILING = {"block_hopper": 7.60, "block_half_cheetah": 16.27}  # walls per episode of the blind gait, as the page says
 
 
 def has_walls(envs: Any) -> bool:

@@ -13,12 +13,12 @@ from typing import Any
 
 import torch
 
+from experiments.choices import ROOT
 from experiments.config import Run
 from experiments.status import read_status
 from hippo.core.files import DamagedFile, read_json, set_aside
 from hippo.core.settings import ConfigError
 
-ROOT = Path(__file__).parent.parent
 UNKNOWN = "unknown"
 CODE_SUFFIXES = (".py", ".yaml", ".xml", ".toml", ".lock")  # of files that git does not track yet
 # What may differ between the stretches of a run that was interrupted.

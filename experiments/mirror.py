@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from experiments.command_line import EXIT_FAILED, Parser, bad_input, run_command
-from experiments.config import WANDB_MODES, WandbConfig
 from experiments.evaluate import load_finished_run
+from experiments.schema import WANDB_MODES, WandbConfig
 from hippo.core.mirror import log_of, start_mirror
 from hippo.core.settings import ConfigError
 

@@ -5,7 +5,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from experiments.config import nearest
+from experiments.choices import nearest
 from experiments.own_sweep import names
 from experiments.plan import Plan
 from hippo.core.settings import ConfigError

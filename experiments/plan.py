@@ -13,8 +13,9 @@ import yaml
 
 from analysis.edition import PAPER, Edition
 from experiments import costs
+from experiments.choices import COMMITTED, CONF, check_choice, choices
 from experiments.command_line import duration
-from experiments.config import COMMITTED, CONF, Run, check_choice, choices, compose_run
+from experiments.config import Run, compose_run
 from experiments.status import ABANDONED_SECONDS, DONE, is_there, read_status, remove_abandoned, write_atomically
 from hippo.core.settings import ConfigError
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import yaml
 
-from experiments.config import CONF, nearest
+from experiments.choices import CONF, nearest
 from hippo.core.settings import ConfigError, check, setting
 
 YEAR = 365 * 24 * 60  # minutes

@@ -6,7 +6,7 @@
 A study is a file of conf/study: its `variants`, each times all combinations of `over`, in its environments with its
 seeds. Rows of finished runs are kept in paper_figures/data/studies/<name>.csv, which `run` adds to; `show` writes
 docs/studies/<name>.md and the picture beside it from nothing else. With `peer: true` Stable-Baselines3's PPO stands
-beside its variants, with the seeds that experiments.peer_curves has trained.
+beside its variants, with the seeds that experiments.artefacts.peer_curves has trained.
 """
 
 import argparse
@@ -27,16 +27,17 @@ import yaml
 
 from analysis import stats
 from analysis.runs import COLUMNS, Results, read_committed, read_progress, scores
-from experiments import peer_curves, sweep
+from experiments import peer_rows, sweep
+from experiments.choices import COMMITTED, CONF, ROOT, check_choice, choices
 from experiments.command_line import EXIT_FAILED, EXIT_REQUEUE, Parser, bad_input, clock, run_command
 from experiments.commit import as_csv
-from experiments.config import COMMITTED, CONF, Run, check_choice, choices, compose_run
+from experiments.config import Run, compose_run
 from experiments.plan import Entry, env_label
 from experiments.status import DONE, check_locks, read_status, write_atomically
 from hippo.core.settings import ConfigError
 from paper_figures import curves, style
 
-ROWS, PAGES = COMMITTED / "studies", Path(__file__).parent.parent / "docs" / "studies"
+ROWS, PAGES = COMMITTED / "studies", ROOT / "docs" / "studies"
 REPORT_SECONDS = 30.0  # between two progress lines
 WITHIN = 1.01  # of a study's budget, to which the peer's iterations do not add up exactly
 
@@ -58,21 +59,21 @@ class Study:
 
     def peer(self) -> pd.DataFrame:
         """The rows of Stable-Baselines3's PPO that belong to the study, up to its budget, as its own are."""
-        rows = peer_curves.read(peer_curves.ROWS)
+        rows = peer_rows.read(peer_rows.ROWS)
         budgets = {entry.run.env: entry.run.env_steps for entry in self.entries if self.description.get("peer")}
         rows = rows[rows["env_steps"] <= WITHIN * rows["env"].map(budgets).fillna(0)]
         run_ids = "stable_baselines3_seed_" + rows["seed"].astype(str)
-        labels = {"figure": self.name, "scale": self.entries[0].run.scale, "variant": peer_curves.LABEL}
+        labels = {"figure": self.name, "scale": self.entries[0].run.scale, "variant": peer_rows.LABEL}
         return rows.assign(**labels, run_id=run_ids, metric="return_mean", value=rows["return_mean"])[COLUMNS]
 
     def results(self, frame: pd.DataFrame) -> Results:
         """Rows of the study as those of a figure, so that they can be drawn as one."""
         runs = [entry.as_planned() for entry in self.entries]
-        beside = frame[frame["variant"] == peer_curves.LABEL]
+        beside = frame[frame["variant"] == peer_rows.LABEL]
         for (env, seed), rows in beside.groupby(["env", "seed"]):
             budget = {"iterations": len(rows), "batch_size": round(rows["env_steps"].max() / len(rows))}
             of_peer = {"run_id": rows["run_id"].iloc[0], "env": env, "seed": seed, "env_label": env_label(str(env))}
-            labels = dict.fromkeys(("variant", "variant_label"), peer_curves.LABEL)
+            labels = dict.fromkeys(("variant", "variant_label"), peer_rows.LABEL)
             runs.append({**runs[0], **of_peer, **labels, **budget})
         first, there = self.entries[0].run, set(frame["run_id"])
         edition = {"scale": first.scale, "protocol": first.protocol}
@@ -155,7 +156,7 @@ def table(study: Study, frame: pd.DataFrame) -> list[str]:
     environments = list(study.description["environments"])
     labels = dict.fromkeys((e.group, e.variant) for e in study.entries)
     if study.description.get("peer"):
-        labels[peer_curves.LABEL, peer_curves.LABEL] = None
+        labels[peer_rows.LABEL, peer_rows.LABEL] = None
     finals, areas, counts = {}, {}, {}
     for (_, label), env in itertools.product(labels, environments):
         seeds, _, columns = scores(frame, env, label)

@@ -16,13 +16,10 @@ python -m experiments.sweep compare lr                 its learning curves and a
 
 import argparse
 import functools
-import math
-import os
 import shlex
 import shutil
 import signal
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -32,12 +29,11 @@ from experiments.command_line import (
     EXIT_FAILED,
     EXIT_NOT_AGREED,
     EXIT_REQUEUE,
-    Parser,
     bad_input,
     clock,
     run_command,
 )
-from experiments.config import Run, check_choice, choices
+from experiments.config import Run
 from experiments.console import unattended
 from experiments.launchers import run_locally
 from experiments.own_compare import compare
@@ -45,15 +41,12 @@ from experiments.plan import Plan, make_plan, overview, refused_lines, summary, 
 from experiments.slurm_profile import load_profile
 from experiments.status import DONE, check_locks, is_locked, read_status
 from experiments.status_table import may_retry, show_status
+from experiments.sweep_options import check_options, check_runs_dir, named, parse
 from hippo.core.files import printable
 from hippo.core.settings import ConfigError
 
-LAUNCHERS = ("local", "slurm")
-ORDERS = ("longest", "seeds")
-TARGETS = "a figure or table of conf/figure, or a sweep of your own; `plan` and `write` also take all"
 REPORT_SECONDS = 10.0  # between two progress lines
 NAMED = 4  # runs in progress that a progress line names
-CORE_HOURS = 2.0  # more than this is not started without being agreed to
 
 
 Report = Callable[[Sequence[Run], int], None]  # takes the runs in progress and the number of those that ended
@@ -186,39 +179,9 @@ def name_failures(plan: Plan, todo: Sequence[Run], states: dict[str, str]) -> in
     return EXIT_FAILED if bad else 0
 
 
-def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
-    """The command line."""
-    parser = Parser(prog="experiments.sweep", description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("action", choices=tuple(ACTIONS))
-    parser.add_argument("targets", nargs="*", metavar="figure", help=TARGETS)
-    parser.add_argument("--scale", help="smoke (default), laptop or paper")
-    parser.add_argument("--protocol", help="paper (default) or modern")
-    parser.add_argument("--launcher", default="local", help=", ".join(LAUNCHERS))
-    parser.add_argument("--workers", type=int, default=len(os.sched_getaffinity(0)), help="processes, one thread each")
-    parser.add_argument("--profile", type=Path, help="slurm: what jobs ask for (default: conf/slurm/default.yaml)")
-    parser.add_argument("--dry-run", action="store_true", help="train nothing; slurm: say what would be submitted")
-    parser.add_argument("--wait", action="store_true", help="slurm: return when the jobs have ended, not at once")
-    parser.add_argument("--runs-dir", type=Path, default=Path("runs"))
-    parser.add_argument("--fresh", action="store_true", help="ignore committed results")
-    parser.add_argument("--env", type=lambda text: text.split(","), metavar="NAME[,NAME...]", help="only in these")
-    parser.add_argument(
-        "--order",
-        default=ORDERS[0],
-        help="local: the longest run first, or seeds: all variants of seed 0, then of 1...",
-    )
-    parser.add_argument("--only", action="append", metavar="RUN_ID", help="nothing but this run and what it needs")
-    parser.add_argument("--max-core-hours", type=float, default=CORE_HOURS, help="start no more than this unasked")
-    parser.add_argument("--yes", action="store_true", help="start it all the same")
-    parser.add_argument("--watch", action="store_true", help="status: again and again until nothing runs")
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="override in every run")
-    own_sweep.add_options(parser)
-    parser.add_argument("--out", type=Path, help="compare: where pictures and tables go")
-    return parser.parse_intermixed_args(arguments)
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Plan, run, report or retry; the exit code is 0 when everything asked for is there."""
-    options = parse(arguments)
+    options = parse(arguments, ACTIONS, __doc__)
 
     def plan_of(figure: str) -> Plan:
         if (sweep := own_sweep.chosen(options)) is not None:
@@ -243,30 +206,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return EXIT_FAILED
 
 
-def check_options(options: argparse.Namespace) -> None:
-    """Raise ConfigError for what argparse does not check."""
-    check_choice("launcher", options.launcher, LAUNCHERS)
-    several = options.action in ("compare", "collect")
-    if len(options.targets) > 1 and not several:
-        raise ConfigError("figure", " ".join(options.targets), f"{options.action} takes one figure or sweep at a time")
-    options.figure = options.targets[0] if options.targets else None
-    check_choice("order", options.order, ORDERS if options.launcher == "local" else ORDERS[:1])
-    if options.workers < 1:
-        raise ConfigError("workers", options.workers, "must be at least 1")
-    if not 0 <= options.max_core_hours < math.inf:  # nor nan, which is above nothing
-        raise ConfigError("max-core-hours", options.max_core_hours, "must be 0 or more; --yes starts any number")
-
-
-def check_runs_dir(folder: Path) -> None:
-    """Raise ConfigError unless runs can be written in `folder`, which is made where it is missing."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-    except OSError as error:
-        raise ConfigError("runs-dir", folder, f"must be a folder that can be written ({error.strerror})") from None
-
-
 def show_plan(options: argparse.Namespace, plan_of: Callable[[str], Plan]) -> int:
     """`plan`."""
     print(overview([plan_of(figure) for figure in named(options)], options.workers))
@@ -281,11 +220,6 @@ def write_plans(options: argparse.Namespace, plan_of: Callable[[str], Plan]) -> 
         own_sweep.store(plan, options.runs_dir)
         plan.write(options.runs_dir)
     return 0
-
-
-def named(options: argparse.Namespace) -> list[str]:
-    """The figures and tables that the command line names."""
-    return choices("figure") if options.figure == "all" else [options.figure]
 
 
 def run_or_retry(options: argparse.Namespace, plan_of: Callable[[str], Plan]) -> int:

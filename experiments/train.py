@@ -28,10 +28,12 @@ from filelock import Timeout
 
 from experiments import usage
 from experiments.command_line import EXIT_DIVERGED, EXIT_FAILED, EXIT_REQUEUE, Parser, bad_input, clock, run_command
-from experiments.config import PRETRAINED, Run, committed_skills, compose_run, unquoted
+from experiments.config import Run, committed_skills, compose_run
 from experiments.console import unattended
 from experiments.evaluate import as_csv, evaluate_all
 from experiments.manifest import from_manifest, manifest_with_history
+from experiments.refusals import unquoted
+from experiments.schema import PRETRAINED
 from experiments.status import (
     HEARTBEAT_SECONDS,
     SILENT,
@@ -193,7 +195,7 @@ def prepare(run: Run) -> Callable[[int, str], Any]:
     torch.set_num_threads(1)
     # Of two functions that refuse what is not deterministic, the one that does not import the compiler.
     torch.set_deterministic_debug_mode("error")
-    # Filling fresh memory would be in vain: nothing is read before it is written (tests/test_golden.py sees to it).
+    # Filling fresh memory would be in vain: nothing is read before it is written (tests/hippo/test_golden.py).
     torch.utils.deterministic.fill_uninitialized_memory = False  # type: ignore[attr-defined]
 
     def make_envs(num_envs: int, purpose: str) -> Any:

@@ -5,18 +5,10 @@ import json
 from pathlib import Path
 from typing import Any
 
-from experiments.config import (
-    BUDGET_FIELDS,
-    GROUPS,
-    LogConfig,
-    Run,
-    RunSchema,
-    WandbConfig,
-    default_of,
-    group_choices,
-    level_of,
-    option_fields,
-)
+from experiments.choices import GROUPS, group_choices
+from experiments.config import Run
+from experiments.refusals import level_of
+from experiments.schema import BUDGET_FIELDS, LogConfig, RunSchema, WandbConfig, default_of, option_fields
 from hippo.envs import environment
 
 BOUNDS = {"above": "above {}", "low": "at least {}", "high": "at most {}"}

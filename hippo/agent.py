@@ -23,7 +23,8 @@ from hippo.core.checkpoint import Checkpoint, CheckpointError, save
 from hippo.core.files import DamagedFile, read_json, write_synced
 from hippo.core.log import RunLog
 from hippo.envs import make
-from hippo.envs.foreign import GymnasiumEnv, Layout, layout_of_spaces
+from hippo.envs.foreign import GymnasiumEnv
+from hippo.envs.layout import Layout, layout_of_spaces
 from hippo.envs.vector import RobotTaskEnv
 from hippo.learners import LEARNERS, config_class, learner_of
 
@@ -267,7 +268,7 @@ def train(
     torch.set_num_threads(1)
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    algo = next(name for name, (module, _) in LEARNERS.items() if module == type(config).__module__)
+    algo = next(name for name, (_, settings) in LEARNERS.items() if settings == type(config).__name__)
     log = RunLog(folder, lambda metrics, timing: on_iteration(dict(metrics)) if on_iteration else None)
     task = Task.of(envs)
     learner_of(algo).train(config, lambda num_envs, purpose: envs, log, seed, Checkpoint(folder, "", log))

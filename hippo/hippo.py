@@ -6,44 +6,38 @@ A manager pi_h(z|s) commits to a skill z for p steps; the skill pi_l(a|s, z) act
 
 where k runs over the manager's decisions and t over environment steps. Where to find what:
 
-    Algorithm 1, HiPPO Rollout; the commitment     hippo/core/hierarchy.py   collect, Commitment
+    Algorithm 1, HiPPO Rollout                     hippo/core/hierarchy.py   collect
+      lines 4, 5: draw p, then z ~ pi_h                                      Commitment.renew, Acting.decide
+      lines 6 to 9: a ~ pi_l for p steps                                     Acting.action, Commitment.advance
     settings of the hierarchy (n, p, networks)     hippo/core/hierarchy.py   HierarchyConfig
-    advantages and both baselines (section 4.2)    hippo/core/advantages.py  advantages
-    the clipped surrogate L^CLIP                   hippo/core/ppo.py         clipped_surrogate, maximize
-    minibatches, running statistics (modern)       hippo/core/on_policy.py   SurrogateConfig, improve
-    Lemma 1: exact and approximate gradient        hippo/gradients.py
     Algorithm 2, HiPPO                             here                      train
+      line 4: N trajectories                       hippo/core/hierarchy.py   collect
+      line 5: advantages of both levels (4.2)      hippo/core/advantages.py  advantages
+      line 7: the two terms of equation 4          hippo/core/levels.py      levels
+              clipped, L^CLIP, ascended            hippo/core/ppo.py         clipped_surrogate, maximize
+              in minibatches (modern)              hippo/core/on_policy.py   SurrogateConfig, improve
+    Lemma 1: exact and approximate gradient        hippo/gradients.py
 """
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 from torch import nn
 
 from hippo.core import seeding
 from hippo.core.advantages import Baselines, advantages
 from hippo.core.checkpoint import Checkpoint
-from hippo.core.hierarchy import (
-    Acting,
-    HierarchicalPolicy,
-    HierarchyConfig,
-    collect,
-    levels,
-    policy_statistics,
-    restored,
-)
+from hippo.core.hierarchy import Acting, HierarchyConfig, collect, new_policy, restored
+from hippo.core.levels import levels, policy_statistics
 from hippo.core.log import RunLog, check_finite
 from hippo.core.on_policy import SurrogateConfig, improve, make_optimizer
 from hippo.core.settings import ConfigError, setting
 from hippo.core.skills import start_from
+from hippo.core.training import MakeEnvs, Training
 
 __all__ = ["Acting", "HippoConfig", "restored", "train"]
 
 REVISION = 1  # bumped by every change that alters the metrics of tests/golden
-
-MakeEnvs = Callable[[int, str], Any]  # (num_envs, purpose) -> a vector environment that knows its robot_size
 
 
 @dataclass
@@ -71,9 +65,8 @@ def train(config: HippoConfig, make_envs: MakeEnvs, log: RunLog, seed: int, chec
         Diverged: an observation, a reward or a parameter is no longer finite.
     """
     envs = make_envs(config.num_envs, "training")
-    obs_size, action_size = envs.single_observation_space.shape[0], envs.single_action_space.shape[0]
-    generator = seeding.torch_generator(seed, "initialisation")
-    policy = HierarchicalPolicy(config, obs_size, envs.robot_size, action_size, generator)
+    obs_size, generator = envs.single_observation_space.shape[0], seeding.torch_generator(seed, "initialisation")
+    policy = new_policy(config, envs, generator)
     start_from(config.skills, policy.skills, envs)
     baselines = Baselines(config, obs_size, generator, in_loop=config.values_in_loop)
     # A frozen level stays out of the optimiser, log-std included.
@@ -84,10 +77,9 @@ def train(config: HippoConfig, make_envs: MakeEnvs, log: RunLog, seed: int, chec
     optimizer = make_optimizer(config, trained)
 
     parts = {"policy": policy, "baselines": baselines, "optimizer": optimizer}
-    first = checkpoint.restore(**parts)
-    log.resume(first)
+    training = Training(log, checkpoint, parts)
 
-    for iteration in range(first, config.iterations):
+    for iteration in range(training.begin(), config.iterations):
         start = time.perf_counter()
         batch = collect(policy, envs, config, seed, iteration)
         steps = batch.steps
@@ -106,13 +98,9 @@ def train(config: HippoConfig, make_envs: MakeEnvs, log: RunLog, seed: int, chec
         end = time.perf_counter()
 
         metrics = {
-            "iteration": iteration,
-            "env_steps": (iteration + 1) * steps.num_steps,
-            **steps.statistics(),
             **losses,
             **{f"{kind}_explained_variance": value for kind, value in estimate.explained_variance.items()},
             **statistics,
         }
-        log.row(metrics, steps.timing(start, collected, end))
-        checkpoint.record(iteration, **parts)
+        training.record(iteration, steps, (start, collected, end), metrics)
     envs.close()

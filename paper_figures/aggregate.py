@@ -2,7 +2,7 @@
 
 A run's score is its return over the last 0.1 M environment steps before 1 M, relative to the mean of
 Stable-Baselines3's PPO on the same task at the same place; 1 is as good as that. Only tasks of which these curves are
-kept (experiments.peer_curves) take part, and only under the modern protocol, which is set up like it.
+kept (experiments.artefacts.peer_curves) take part, and only under the modern protocol, which is set up like it.
 """
 
 import argparse

@@ -5,12 +5,12 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from analysis.command_line import parser
+from analysis.command_line import bad_input, parser
 from analysis.runs import MissingData, NotAtThisScale, Results, load
 
 HERE = Path(__file__).parent
 SMOOTH = 0.05  # share of a method's iterations that the moving mean of a learning curve takes
-BAD_INPUT, NOTHING_YET = 2, 3  # exit codes
+NOTHING_YET = 3  # exit code
 
 
 def parse(artefact: str, arguments: Sequence[str] | None) -> argparse.Namespace:
@@ -52,8 +52,7 @@ def make(
         print(f"not drawn: {missing}", file=sys.stderr)
         return NOTHING_YET
     except ValueError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return BAD_INPUT
+        return bad_input(error)
     for what in results.missing_lines():
         print(f"{artefact}: missing or incomplete: {what}")
     print(write(results, options))

@@ -19,10 +19,11 @@ import pandas as pd
 import yaml
 
 from analysis import stats
+from analysis.command_line import bad_input
 from analysis.edition import PAPER, Edition
 from analysis.runs import COLUMNS, PATTERNS, Results, altered, read_commits, read_progress, scores
 from paper_figures import curves
-from paper_figures.command_line import BAD_INPUT, HERE, SMOOTH, share
+from paper_figures.command_line import HERE, SMOOTH, share
 
 OUT = HERE / "out" / "compare"
 TABLE = ("environment", "label", "final", "low", "high", "area", "seeds", "hours")
@@ -173,8 +174,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         results = gather(options.runs)
     except ValueError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return BAD_INPUT
+        return bad_input(error)
     show(results, {planned(folder)["run_id"]: folder for folder in options.runs}, options.out, options.smooth)
     return 0
 

@@ -12,7 +12,8 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from paper_figures.command_line import BAD_INPUT, NOTHING_YET
+from analysis.command_line import BAD_INPUT
+from paper_figures.command_line import NOTHING_YET
 
 SCRIPTS = (path.stem for path in Path(__file__).parent.glob("*.py") if re.fullmatch(r"(fig|table)\d+", path.stem))
 ARTEFACTS = sorted(SCRIPTS, key=lambda name: (name.rstrip("0123456789"), int(re.sub(r"\D", "", name))))

@@ -2,7 +2,7 @@
 
     python -m paper_figures.gallery [--out paper_figures/out] [--table]
 
-draws a picture per robot from what `experiments.gallery` measured; --table prints the measures as Markdown instead.
+draws a picture per robot from what `experiments.artefacts.gallery` measured; --table prints the measures as Markdown.
 """
 
 import argparse

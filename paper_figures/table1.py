@@ -91,14 +91,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def write(results: Results, options: argparse.Namespace) -> str:
     """Write the files; returns the table."""
-    stem = results.stem(options.out)
     episodes = results.frame.groupby(["run_id", "metric"]).size().max()
-    scale = " It says nothing about the methods." if options.scale == "smoke" else ""
-    note = f"Scale: {options.scale}.{scale} {episodes} stochastic episodes per seed. {NOTE} From {results.origin()}."
-    comment = results.provenance()
-    text = tabular.write(stem, results.plan["title"], note, rows(results), comment)
-    results.frame.to_csv(stem.with_suffix(".csv"), index=False, lineterminator="\n")
-    return f"{text}\nwrote {stem}.csv {stem}.md {stem}.tex"
+    note = f"{episodes} stochastic episodes per seed. {NOTE} "
+    return tabular.publish(results, options, rows(results), note)
 
 
 if __name__ == "__main__":

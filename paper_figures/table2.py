@@ -87,13 +87,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def write(results: Results, options: argparse.Namespace) -> str:
     """Write the files; returns the table."""
-    table, stem = rows(results), results.stem(options.out)
-    scale = " It says nothing about the methods." if options.scale == "smoke" else ""
-    note = f"Scale: {options.scale}.{scale} From {results.origin()}."
-    comment = results.provenance()
-    text = tabular.write(stem, results.plan["title"], note, table, comment)
-    results.frame.to_csv(stem.with_suffix(".csv"), index=False, lineterminator="\n")
-    return f"{text}\nwrote {stem}.csv {stem}.md {stem}.tex"
+    return tabular.publish(results, options, rows(results))
 
 
 if __name__ == "__main__":

@@ -1,7 +1,10 @@
 """How every table is written: csv, Markdown, and LaTeX (booktabs) that compiles alone."""
 
+import argparse
 from collections.abc import Sequence
 from pathlib import Path
+
+from analysis.runs import Results
 
 TEX = {
     "\\": r"\textbackslash{}",
@@ -71,6 +74,15 @@ def latex(table: Sequence[Row], comment: str) -> str:
         r"\bottomrule\end{longtable}\end{document}",
     ]
     return "\n".join(lines) + "\n"
+
+
+def publish(results: Results, options: argparse.Namespace, table: Sequence[Row], note: str = "") -> str:
+    """Write the table of `results` as csv (its raw rows), Markdown and LaTeX; returns what to print."""
+    stem, smoke = results.stem(options.out), " It says nothing about the methods." * (options.scale == "smoke")
+    note = f"Scale: {options.scale}.{smoke} {note}From {results.origin()}."
+    text = write(stem, results.plan["title"], note, table, results.provenance())
+    results.frame.to_csv(stem.with_suffix(".csv"), index=False, lineterminator="\n")
+    return f"{text}\nwrote {stem}.csv {stem}.md {stem}.tex"
 
 
 def write(stem: Path, title: str, note: str, table: Sequence[Row], comment: str) -> str:

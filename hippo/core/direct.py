@@ -1,8 +1,8 @@
 """Gradients of small minibatches written out, for learners that take thousands of tiny steps per iteration.
 
 A gradient step on 256 rows costs autograd three times what the arithmetic costs. Here a network's forward and backward
-pass, and what a loss sends back into it, are called one after the other; `tests/test_direct.py` holds each against
-plain torch. Every object overwrites the gradients of its own parameters; an optimiser then steps as always.
+pass, and what a loss sends back into it, are called one after the other; `tests/hippo/test_direct.py` holds each
+against plain torch. Every object overwrites the gradients of its own parameters; an optimiser then steps as always.
 """
 
 from collections.abc import Sequence

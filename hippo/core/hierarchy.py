@@ -3,7 +3,6 @@
 HiPPO, HierVPG and MLSH train this same hierarchy and differ in what they do with a batch of it.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,12 +15,10 @@ from torch import Tensor, nn
 from hippo.core import seeding
 from hippo.core.acting import OfHorizons
 from hippo.core.checkpoint import Checkpoint
-from hippo.core.direct import Categorical, Gaussian, network_of
 from hippo.core.networks import normalize_columns
 from hippo.core.normalize import ObservationFilter, actor_of
 from hippo.core.on_policy import OnPolicyConfig
-from hippo.core.policies import POLICY_HEAD, Manager, SkillPolicy, gaussian_entropy, sample_categorical
-from hippo.core.ppo import Level, Rows
+from hippo.core.policies import POLICY_HEAD, Manager, SkillPolicy, sample_categorical
 from hippo.core.rollout import Steps
 from hippo.core.settings import MOST_SKILLS, WIDEST, ConfigError, setting
 
@@ -329,11 +326,15 @@ def collect(
     return Batch(steps, torch.from_numpy(skill), torch.from_numpy(time_left), decisions, used)
 
 
+def new_policy(config: HierarchyConfig, envs: Any, generator: torch.Generator) -> HierarchicalPolicy:
+    """Freshly drawn networks for these environments."""
+    obs_size, action_size = envs.single_observation_space.shape[0], envs.single_action_space.shape[0]
+    return HierarchicalPolicy(config, obs_size, envs.robot_size, action_size, generator)
+
+
 def restored(config: HierarchyConfig, envs: Any, checkpoint: Checkpoint) -> HierarchicalPolicy:
     """The policy of a checkpoint."""
-    obs_size, action_size = envs.single_observation_space.shape[0], envs.single_action_space.shape[0]
-    generator = seeding.torch_generator(0, "overwritten by the checkpoint")
-    policy = HierarchicalPolicy(config, obs_size, envs.robot_size, action_size, generator)
+    policy = new_policy(config, envs, seeding.torch_generator(0, "overwritten by the checkpoint"))
     checkpoint.restore(policy=policy)
     return policy
 
@@ -343,72 +344,3 @@ def in_whole_periods(is_decision: Tensor, period: int) -> Tensor:
     segment = is_decision.long().cumsum(0) - 1
     length = torch.zeros_like(segment).scatter_add_(0, segment, torch.ones_like(segment))
     return length.gather(0, segment) == period
-
-
-def rows_by_skill(batch: Batch) -> Tensor:
-    """Which of the flattened (T N) steps are learnt from, sorted by skill as the skill network wants."""
-    used = batch.used.flatten().nonzero().squeeze(-1)
-    return used[batch.skill[:-1].flatten()[used].argsort(stable=True)]
-
-
-def levels(
-    policy: HierarchicalPolicy,
-    batch: Batch,
-    manager_advantage: Tensor,
-    skill_advantage: Tensor,
-    trained: Sequence[str] = ("manager", "skill"),
-) -> list[Level]:
-    """Log-probabilities and advantages of both levels: the manager at its decisions, the skills at every step.
-
-    Rows of the skills are sorted by skill; `at` says which of them hold a decision, and which.
-
-    Args:
-        manager_advantage, skill_advantage: (T, N). trained: the levels to return.
-    """
-    result = []
-    obs, skill, time_left = (x[:-1].flatten(0, 1) for x in (batch.steps.obs, batch.skill, batch.time_left))
-    rows = rows_by_skill(batch)
-    if "manager" in trained:
-        where = (batch.is_decision[:-1] & batch.used).flatten()
-        manager_input, choice = policy.manager_input(obs[where], time_left[where]), skill[where].unsqueeze(-1)
-        decision = torch.where(where, where.cumsum(0) - 1, -1)[rows]
-
-        def manager_log_prob(c: Rows) -> Tensor:
-            return policy.manager.log_probs(manager_input[c]).gather(-1, choice[c]).squeeze(-1)
-
-        def manager_direct() -> Categorical:
-            return Categorical(network_of(policy.manager.logits.layers), manager_input, choice.squeeze(-1))
-
-        advantage = manager_advantage.flatten()[where].to(obs.dtype)
-        result.append(Level("manager", manager_log_prob, advantage, manager_direct, decision))
-    if "skill" in trained:
-        skill_input, active = policy.skill_input(obs[rows], time_left[rows]), skill[rows]
-        action = batch.steps.action.flatten(0, 1)[rows]
-
-        def skill_log_prob(c: Rows) -> Tensor:
-            return policy.skills.log_prob(skill_input[c], active[c], action[c])
-
-        def skill_direct() -> Gaussian:
-            network = network_of([policy.skills.first, *policy.skills.rest.layers])
-            return Gaussian(network, policy.skills.log_std_parameter, skill_input, active, action)
-
-        advantage = skill_advantage.flatten()[rows].to(obs.dtype)
-        result.append(Level("skill", skill_log_prob, advantage, skill_direct))
-    return result
-
-
-@torch.no_grad()
-def policy_statistics(policy: HierarchicalPolicy, batch: Batch) -> dict[str, float]:
-    """How the hierarchy behaved in a batch: entropies, commitment length, action noise, use of every skill."""
-    skill, is_decision = batch.skill[:-1], batch.is_decision[:-1]
-    usage = torch.bincount(skill.flatten(), minlength=policy.num_skills) / skill.numel()
-    decided = policy.manager_input(batch.steps.obs[:-1][is_decision], batch.time_left[:-1][is_decision])
-    log_probs = policy.manager.log_probs(decided)
-    log_std = policy.skills.log_std()
-    return {
-        "manager_entropy": float(-(log_probs.exp() * log_probs).sum(-1).mean()),
-        "skill_entropy": float(usage @ gaussian_entropy(log_std)),
-        "action_std": float(log_std.exp().mean()),
-        "commitment_mean": float(skill.numel() / is_decision.sum()),
-        **{f"skill_{z}_usage": float(share) for z, share in enumerate(usage)},
-    }

@@ -5,7 +5,6 @@ small initial policies, minibatches that train the value functions too) is off u
 asks for it.
 """
 
-import dataclasses
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
@@ -14,31 +13,21 @@ import torch
 from torch import nn
 
 from hippo.core import seeding
+from hippo.core.budget import BudgetConfig
 from hippo.core.direct import SquaredError
 from hippo.core.minibatch import minibatches
 from hippo.core.normalize import ObservationFilter
 from hippo.core.optimizers import Adam
 from hippo.core.ppo import Level, in_chunks, maximize
-from hippo.core.settings import MOST_STEPS, WIDEST, ConfigError, check, setting
+from hippo.core.settings import WIDEST, ConfigError, setting
 
 ADAM_EPSILON = 1e-5  # of the minibatches' Adam (OpenAI Baselines)
 
 
 @dataclass
-class OnPolicyConfig:
-    """Budget, discount, baselines and what is done to observations, rewards and initial weights."""
+class OnPolicyConfig(BudgetConfig):
+    """Discount, baselines and what is done to observations, rewards and initial weights."""
 
-    iterations: int = setting(dataclasses.MISSING, "training iterations", code="2000 on Gather (README)", low=1)
-    batch_size: int = setting(
-        dataclasses.MISSING,
-        "environment steps per iteration",
-        paper="Block 50 000, Gather 100 000 (App. A)",
-        low=1,
-        high=MOST_STEPS,
-    )
-    horizon: int = setting(
-        dataclasses.MISSING, "episode length H in steps", paper="Block 1000, Ant 5000, Snake 8000 (App. A)", low=1
-    )
     gamma: float = setting(
         0.999, "discount per environment step", paper="0.999 (App. A)", code="0.99, 0.999 by flag", above=0.0, high=1.0
     )
@@ -73,16 +62,6 @@ class OnPolicyConfig:
     scale_rewards: bool = setting(
         False, "learn from rewards over the running deviation of the discounted return", code="no"
     )
-
-    def __post_init__(self) -> None:
-        check(self)
-        if self.batch_size < self.horizon:
-            raise ConfigError("batch_size", self.batch_size, f"must be at least one horizon, {self.horizon} steps")
-
-    @property
-    def num_envs(self) -> int:
-        """Slots that collect one horizon each; ceil(batch / horizon)."""
-        return -(-self.batch_size // self.horizon)
 
 
 @dataclass(kw_only=True)

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from hippo.core import seeding
+from hippo.core.budget import BudgetConfig
 from hippo.core.checkpoint import Checkpoint
 from hippo.core.gae import gae
 from hippo.core.log import RunLog, check_finite
@@ -22,12 +23,13 @@ from hippo.core.optimizers import Adam
 from hippo.core.policies import SkillPolicy, gaussian_entropy
 from hippo.core.ppo import Level, Rows, maximize
 from hippo.core.rollout import LastInfo, Steps
-from hippo.core.settings import MOST_SKILLS, MOST_STEPS, WIDEST, ConfigError, check, setting
+from hippo.core.settings import MOST_SKILLS, MOST_STEPS, WIDEST, setting
+from hippo.core.training import Training
 from hippo.core.value import ValueFunction, explained_variance
 
 
 @dataclass
-class PretrainingConfig:
+class PretrainingConfig(BudgetConfig):
     """What both ways to pre-train skills set; names are those of HierarchyConfig."""
 
     iterations: int = setting(
@@ -72,16 +74,6 @@ class PretrainingConfig:
         [32, 32], "hidden layers of the baseline V(s, z)", ours="HiPPO's", low=1, high=WIDEST
     )
     value_iterations: int = setting(10, "the most loss evaluations of a fit of the baseline", ours="HiPPO's", low=1)
-
-    def __post_init__(self) -> None:
-        check(self)
-        if self.batch_size < self.horizon:
-            raise ConfigError("batch_size", self.batch_size, f"must be at least one horizon, {self.horizon} steps")
-
-    @property
-    def num_envs(self) -> int:
-        """Slots that collect one horizon each; ceil(batch / horizon)."""
-        return -(-self.batch_size // self.horizon)
 
 
 @dataclass
@@ -162,10 +154,9 @@ def train_skills(
     baseline = ValueFunction(policy.first.inputs, config.value_hidden_sizes, generator, config.num_skills)
     optimizer = Adam(policy.parameters(), lr=config.learning_rate)
     parts = {"policy": policy, "baseline": baseline, "optimizer": optimizer} | objective.parts
-    first = checkpoint.restore(**parts)
-    log.resume(first)
+    training = Training(log, checkpoint, parts)
 
-    for iteration in range(first, config.iterations):
+    for iteration in range(training.begin(), config.iterations):
         start = time.perf_counter()
         paths = collect(policy, envs, config, seed, iteration)
         steps = paths.steps
@@ -183,16 +174,12 @@ def train_skills(
         check_finite(iteration, parameters=nn.utils.parameters_to_vector(learnt))
         end = time.perf_counter()
         row = {
-            "iteration": iteration,
-            "env_steps": (iteration + 1) * steps.num_steps,
-            **steps.statistics(),
             "skill_reward": float(reward.mean()),
             **metrics,
             **losses,
             **statistics,
         }
-        log.row(row, steps.timing(start, collected, end))
-        checkpoint.record(iteration, **parts)
+        training.record(iteration, steps, (start, collected, end), row)
     envs.close()
 
 

@@ -14,11 +14,12 @@ from pathlib import Path
 import pytest
 import yaml
 
-from experiments import slurm, slurm_profile, sweep
+from experiments import code_snapshot, slurm, slurm_profile, sweep
 from experiments.config import compose_run
 from experiments.launchers import run_locally
 from experiments.plan import make_plan
 from experiments.status import read_status
+from tests import ROOT
 from tests.slurm.cluster import Cluster, missing
 
 pytestmark = [
@@ -134,10 +135,10 @@ def test_what_depends_on_another_run_waits_for_it(cluster, tmp_path):
 
 
 def test_the_code_that_jobs_run_is_a_copy(tmp_path):
-    copy = slurm.snapshot(tmp_path)
+    copy = code_snapshot.snapshot(tmp_path)
     assert (copy / "experiments/train.py").read_bytes() == Path(slurm.__file__).with_name("train.py").read_bytes()
     assert "git_commit" in json.loads((copy / "snapshot.json").read_text())
-    assert slurm.snapshot(tmp_path) == copy
+    assert code_snapshot.snapshot(tmp_path) == copy
 
 
 def test_jobs_find_the_kernels_that_were_compiled_before(tmp_path):
@@ -153,8 +154,8 @@ print(policies.__file__, sum(policies._sample_categorical.stats.cache_misses.val
         assert Path(path).is_relative_to(folder)
         return int(misses)
 
-    compiled_in(slurm.ROOT)
-    assert compiled_in(slurm.snapshot(tmp_path)) == 0
+    compiled_in(ROOT)
+    assert compiled_in(code_snapshot.snapshot(tmp_path)) == 0
 
 
 def test_a_cluster_that_does_not_answer_is_one_clear_error(cluster, tmp_path, monkeypatch, capsys):

@@ -1,0 +1,1 @@
+"""What makes the committed pages, tables, pictures and rows that no training run makes: a command per artefact."""

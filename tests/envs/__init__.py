@@ -1,0 +1,1 @@
+"""The environments: the contract of all, golden trajectories, each task against numbers by hand."""

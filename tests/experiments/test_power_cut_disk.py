@@ -1,0 +1,99 @@
+"""The power cut itself: the image of a live ext4 is copied while a run trains on it, mounted elsewhere, and goes on.
+
+What the kernel had not yet written is not in the copy, as after a cut. The replay in test_power_cut.py needs no
+privileges and tries more points; this one asks a real file system.
+"""
+
+import contextlib
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from experiments import train
+from experiments.config import compose_run
+from experiments.status import read_status
+from tests import ROOT
+
+pytestmark = pytest.mark.slow
+SETTINGS = ["algo=ppo", "env=block_hopper", "scale=smoke", "iterations=30", "batch_size=400"]
+CUTS, MEGABYTES = 6, 32
+RESULTS = ("progress.csv", "checkpoint.pt")
+
+
+def do(*command):
+    subprocess.run(command, check=True, capture_output=True)
+
+
+@contextlib.contextmanager
+def mounted(image, place):
+    """The file system in `image`, at `place` while the block runs."""
+    place.mkdir(exist_ok=True)
+    do("mount", "-o", "loop", str(image), str(place))
+    try:
+        yield place
+    finally:
+        do("umount", str(place))
+
+
+@pytest.fixture
+def image(tmp_path):
+    """An empty ext4 in a file, which can be mounted here."""
+    path = tmp_path / "disk.img"
+    with path.open("wb") as file:
+        file.truncate(MEGABYTES * 2**20)
+    try:
+        do("mkfs.ext4", "-q", str(path))
+        with mounted(path, tmp_path / "try"):
+            pass
+    except (OSError, subprocess.CalledProcessError) as error:
+        said = getattr(error, "stderr", b"") or str(error).encode()
+        pytest.skip(f"no loop device can be had here (needs root and mkfs.ext4): {said.decode().strip()}")
+    return path
+
+
+def cut(image, copy, pid):
+    """Copy the image as it is at one moment: the process stands still, and a copy that the kernel wrote into is made
+    anew."""
+    os.kill(pid, signal.SIGSTOP)
+    try:
+        before = None
+        while (now := image.read_bytes()) != before:
+            before = now
+        copy.write_bytes(now)
+    finally:
+        os.kill(pid, signal.SIGCONT)
+
+
+def test_a_run_on_a_disk_whose_power_is_cut_goes_on_to_the_same_bytes(image, tmp_path):
+    command = [sys.executable, "-m", "experiments.train", *SETTINGS, f"runs_dir={tmp_path / 'disk'}"]
+    copies, pauses = [], random.Random(0)
+    with mounted(image, tmp_path / "disk") as disk:
+        run = compose_run(SETTINGS, disk)
+        with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL) as process:
+            while not (run.folder / "progress.csv").exists() and process.poll() is None:
+                time.sleep(0.01)
+            while len(copies) < CUTS and process.poll() is None:
+                time.sleep(pauses.uniform(0.2, 1.2))
+                copies.append(tmp_path / f"{len(copies)}.img")
+                cut(image, copies[-1], process.pid)
+        assert process.returncode == 0
+        whole = {name: (run.folder / name).read_bytes() for name in RESULTS}
+    found = []
+    for copy in copies:
+        with mounted(copy, tmp_path / "elsewhere") as elsewhere:
+            again = compose_run(SETTINGS, elsewhere)
+            left = again.folder / "progress.csv"
+            found.append((read_status(again.folder)["state"], left.read_bytes().count(b"\n") if left.exists() else 0))
+            assert train.execute(again) == "finished", found
+            assert {name: (again.folder / name).read_bytes() for name in RESULTS} == whole, found
+            assert read_status(again.folder)["state"] == "finished"
+        copy.unlink()
+    print(f"{len(copies)} power cuts, the same bytes after each; state and lines of the log that each left: {found}")
+    assert len({lines for _, lines in found}) >= 4
+    shutil.rmtree(tmp_path / "elsewhere")
