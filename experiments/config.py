@@ -88,8 +88,8 @@ class Budget:
 class OffPolicyBudget:
     """What an off-policy learner (HIRO) gets at one scale, whatever the environment."""
 
-    iterations: int = MISSING
-    batch_size: int = MISSING
+    steps: int = MISSING  # in all
+    batch_size: int = MISSING  # environment steps per iteration, down to whole horizons
 
 
 @dataclass
@@ -314,8 +314,16 @@ def check_choice(key: str, value: str, valid: Sequence[str]) -> str:
     return value
 
 
+def whole(batch: int, horizon: int) -> int:
+    """Environment steps that an iteration takes: a batch, up to whole horizons, as every learner collects it."""
+    return -(-batch // horizon) * horizon
+
+
 @functools.cache
 def _register() -> None:
+    # What conf/algo/hiro.yaml makes of an off-policy budget, so that it is the same for every horizon.
+    OmegaConf.register_new_resolver("whole_horizons", lambda batch, horizon: max(horizon, batch // horizon * horizon))
+    OmegaConf.register_new_resolver("iterations_of", lambda steps, batch, horizon: -(-steps // whole(batch, horizon)))
     store = ConfigStore.instance()
     store.store(name="run_schema", node=RunSchema)
     store.store(group="env", name="env_schema", node=EnvConfig)
