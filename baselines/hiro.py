@@ -37,7 +37,7 @@ from hippo.core.td3 import TD3
 
 __all__ = ["Acting", "HiroConfig", "restored", "train"]
 
-REVISION = 1  # bumped by every change that alters the metrics of tests/golden
+REVISION = 2  # bumped by every change that alters the metrics of tests/golden
 
 MakeEnvs = Callable[[int, str], Any]  # (num_envs, purpose) -> a vector environment that knows its robot_size
 
@@ -239,11 +239,10 @@ class Agents(nn.Module):
         during = torch.arange(c) < rows["length"].unsqueeze(1)
         seen, start = obs[:, :-1], self.goals.of_state(obs[:, :1])
         moved = start - self.goals.of_state(seen)  # (B, c, k)
-        scores = []
-        for i in range(candidates.shape[1]):  # one candidate at a time: its rows fit a core's cache
-            goal = candidates[:, i : i + 1] + moved
-            mu = self.low.actor(self.low_input(seen, goal).flatten(0, 1)).view(B, c, -1)
-            scores.append(-((action - mu).square().sum(-1) * during).sum(1))
+        scores = [
+            -((action - mu).square().sum(-1) * during).sum(1)
+            for mu in self.low.actor.of_shifted(self.low_input(seen, moved), candidates)
+        ]
         best = torch.stack(scores, 1).argmax(1)
         return candidates[torch.arange(B), best]
 
@@ -335,6 +334,8 @@ def make_agents(config: HiroConfig, envs: Any, seed: int) -> Agents:
 def skill_rollouts(config: HiroConfig, agents: Agents, memory: Memory, envs: Any, seed: int) -> None:
     """Fill `memory` with roll-outs of the given skills, each goal being the change that its period achieved.
 
+    Where that leaves the box, the goal is the nearest one in it, and it is carried along and paid for as such.
+
     Raises:
         SkillsError: the given skills cannot be read or are another robot's.
     """
@@ -360,18 +361,21 @@ def skill_rollouts(config: HiroConfig, agents: Agents, memory: Memory, envs: Any
     reached = goals.of_state(next_obs)
     for t in reversed(range(T - 1)):
         reached[t] = torch.where(is_over[t].unsqueeze(1), reached[t], reached[t + 1])
-    goal = reached - goals.of_state(steps.obs[:-1])
-    next_goal = reached - goals.of_state(next_obs)  # zero where a period ended, unless another one follows
+    wanted = goals.of_state(steps.obs[:-1]) + goals.clip(reached - goals.of_state(steps.obs[:-1]))
+    for t in range(1, T):  # stays what it was where the period began
+        wanted[t] = torch.where(is_over[t - 1].unsqueeze(1), wanted[t], wanted[t - 1])
+    goal = wanted - goals.of_state(steps.obs[:-1])
+    next_goal = wanted - goals.of_state(next_obs)  # what remains where a period ended, unless another one follows
     follows = is_over[:-1] & ~steps.done[:-1]
     next_goal[:-1] = torch.where(follows.unsqueeze(-1), goal[1:], next_goal[:-1])
     for t in range(T):
         row = {
             "obs": steps.obs[t],
-            "goal": goals.clip(goal[t]),
+            "goal": goal[t],
             "action": steps.action[t],
             "reward": goals.reward(steps.obs[t], goal[t], next_obs[t]),
             "next_obs": next_obs[t],
-            "next_goal": goals.clip(next_goal[t]),
+            "next_goal": next_goal[t],
             "continues": 1.0 - steps.terminated[t].to(steps.obs.dtype),
         }
         memory.add(row, steps.reward[t], is_over[t])
