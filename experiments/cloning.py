@@ -105,8 +105,10 @@ def measure(path: Path, robot: str, steps: int, paths: int, seed: int) -> Distan
     of_clone = chased(agents, envs, wanted, steps, seeding.integer(seed, "episodes", 0))  # the starts of `collect`
     envs.close()
     reached = [np.linalg.norm(from_start(p)[-1], axis=1) for p in (with_noise, by_means)]
-    per_skill = (np.array([x[skill == z].mean() for z in range(policy.num_skills)]) for x in (*reached, of_clone))
-    return Distances(*per_skill, float((with_noise.steps.action.abs() > 1).double().mean()))
+    sampled, means, clone = (
+        np.array([x[skill == z].mean() for z in range(policy.num_skills)]) for x in (*reached, of_clone)
+    )
+    return Distances(sampled, means, clone, float((with_noise.steps.action.abs() > 1).double().mean()))
 
 
 def line(robot: str, of: Distances) -> str:

@@ -49,6 +49,7 @@ class Actor(nn.Module):
         since the rows of one fit a core's cache.
         """
         first = self.layers[0]
+        assert isinstance(first, nn.Linear)
         of_x, of_shift = first(x), shifts @ first.weight[:, -shifts.shape[-1] :].T
         for i in range(shifts.shape[1]):
             yield self._of_first((of_x + of_shift[:, i : i + 1]).flatten(0, 1)).unflatten(0, x.shape[:2])
