@@ -26,7 +26,7 @@ from torch import Tensor, nn
 
 from hippo.core import seeding
 from hippo.core.checkpoint import Checkpoint
-from hippo.core.goals import BODY_GOALS, GOAL_SPACES, Goals, Memory, candidate_goals
+from hippo.core.goals import BODY_GOALS, GOAL_SPACES, POSITION, Goals, Memory, candidate_goals
 from hippo.core.log import RunLog, check_finite
 from hippo.core.optimizers import Adam
 from hippo.core.replay import Replay
@@ -34,6 +34,7 @@ from hippo.core.rollout import LastInfo, Steps
 from hippo.core.settings import MOST_STEPS, WIDEST, ConfigError, check, setting
 from hippo.core.skills import load_skills, policy_of
 from hippo.core.td3 import TD3
+from hippo.core.view import ABSOLUTE
 
 __all__ = ["Acting", "HiroConfig", "restored", "train"]
 
@@ -162,12 +163,19 @@ class Agents(nn.Module):
     """The two levels: what they see, how they act, how they learn."""
 
     def __init__(
-        self, config: HiroConfig, goals: Goals, obs_size: int, action_size: int, generator: torch.Generator
+        self,
+        config: HiroConfig,
+        goals: Goals,
+        obs_size: int,
+        action_size: int,
+        generator: torch.Generator,
+        unseen: Sequence[int] = (),
     ) -> None:
         super().__init__()
         self.config, self.goals = config, goals
+        self.unseen = torch.tensor(unseen, dtype=torch.long)  # entries that neither level may know
         # With x and y in the goal only, the lower level cannot tell where it is, but where it should go (hiro_orig).
-        self.hidden = goals.index[:2] if config.goal_space == "both" else goals.index[:0]
+        self.hidden = goals.index[:2] if config.goal_space == "both" else self.unseen
         action_range = torch.ones(action_size)
         in_range = config.noise_units == "range"
         common: dict[str, Any] = {
@@ -192,6 +200,10 @@ class Agents(nn.Module):
             obs = obs.index_fill(-1, self.hidden, 0.0)
         return torch.cat([obs, goal], -1)
 
+    def manager_input(self, obs: Tensor) -> Tensor:
+        """What the manager sees: (..., D) -> (..., D)."""
+        return obs.index_fill(-1, self.unseen, 0.0) if len(self.unseen) else obs
+
     @torch.no_grad()
     def act(self, obs: Tensor, goal: Tensor, noise: Tensor | None) -> Tensor:
         """Actions (N, A) in [-1, 1]; standard normal `noise` (N, A), None for none."""
@@ -203,7 +215,7 @@ class Agents(nn.Module):
     @torch.no_grad()
     def new_goal(self, obs: Tensor, noise: Tensor | None) -> Tensor:
         """Goals (N, k) within their box; standard normal `noise` (N, k), None for none."""
-        goal = self.manager.actor(obs)
+        goal = self.manager.actor(self.manager_input(obs))
         if noise is not None:
             goal = goal + EXPLORATION * self.manager.unit * noise
         return self.goals.clip(goal)
@@ -221,7 +233,7 @@ class Agents(nn.Module):
         if self.config.off_policy_correction:
             goal = self.relabel(rows, generator)
             relabelled = (goal != rows["goal"]).any(-1).to(goal.dtype).mean()
-        first, last = rows["obs"][:, 0], rows["obs"][:, -1]
+        first, last = (self.manager_input(rows["obs"][:, i]) for i in (0, -1))
         learnt = self.manager.update(first, goal, rows["reward"], last, rows["continues"], generator)
         return torch.cat([learnt, relabelled.unsqueeze(0)])
 
@@ -327,7 +339,10 @@ def make_agents(config: HiroConfig, envs: Any, seed: int) -> Agents:
     else:
         goals = Goals.about(envs.layout.find("goal_space", config.goal_space), config.position_range)
     sizes = envs.single_observation_space.shape[0], envs.single_action_space.shape[0]
-    return Agents(config, goals, *sizes, seeding.torch_generator(seed, "initialisation"))
+    unseen: list[int] = []
+    if config.goal_space == "body" and POSITION[0] not in envs.observation_names:  # "without access to (x, y)"
+        unseen = [i for i, name in enumerate(envs.observation_names) if name in ABSOLUTE]
+    return Agents(config, goals, *sizes, seeding.torch_generator(seed, "initialisation"), unseen)
 
 
 @torch.no_grad()
@@ -341,18 +356,18 @@ def skill_rollouts(config: HiroConfig, agents: Agents, memory: Memory, envs: Any
     """
     path = Path(config.skills)
     policy, _ = policy_of(path)
-    load_skills(path, policy, envs.robot_name, envs.observation_variant)
+    load_skills(path, policy, envs.robot_name, envs.observation_variant)  # whichever view they have
     T, N, goals = config.horizon, envs.num_envs, agents.goals
     tapped = LastInfo(envs)
     steps = Steps(tapped, T, bootstrap_horizon=True)
     rng = seeding.numpy_generator(seed, "roll-outs of given skills")
-    act, size = policy.actor(), policy.first.inputs
+    act = policy.actor()
     obs = steps.reset(seeding.integer(seed, "episodes of given skills"))
     next_obs, is_over = torch.empty_like(steps.obs[1:]), torch.zeros(T, N, dtype=torch.bool)
     skill, age = rng.integers(policy.num_skills, size=N), np.zeros(N, np.int64)
     for t in range(T):
         noise = rng.standard_normal(steps.action.shape[1:], steps.action.numpy().dtype)
-        obs, done = steps.step(t, np.clip(act(obs[:, :size], skill, noise), -1, 1))
+        obs, done = steps.step(t, np.clip(act(policy.see_array(obs), skill, noise), -1, 1))
         next_obs[t] = torch.from_numpy(np.where(done[:, None], tapped.info.get("final_obs", obs), obs))
         age += 1
         ends = done | (age == config.period) | (t == T - 1)

@@ -29,6 +29,7 @@ from hippo.core.rollout import Steps
 from hippo.core.settings import MOST_SKILLS, MOST_STEPS, WIDEST, ConfigError, check, setting
 from hippo.core.skills import start_from
 from hippo.core.value import explained_variance
+from hippo.core.view import Ego, check_view
 
 __all__ = ["Acting", "OptionCriticConfig", "restored", "train"]
 
@@ -123,10 +124,11 @@ class OptionCriticConfig:
     )
     skill_observation: str = setting(
         "robot",
-        "what the intra-option policies see: the robot's own observation or everything",
+        "what the intra-option policies see: the robot's own observation, the same free of place and heading (ego), "
+        "or everything",
         code="everything",
         ours="robot: as HiPPO's skills",
-        choices=("robot", "full"),
+        choices=("robot", "ego", "full"),
     )
     initialisation: str = setting(
         "glorot",
@@ -163,6 +165,13 @@ class OptionCriticConfig:
         check(self)
         if self.batch_size < self.horizon:
             raise ConfigError("batch_size", self.batch_size, f"must be at least one horizon, {self.horizon} steps")
+        if self.skill_observation == "ego" and self.observation_filter and not self.skills:
+            valid = "turns observations as they are: needs observation_filter=false"
+            raise ConfigError("skill_observation", "ego", valid)
+
+    def check_environment(self, robot: str, options: dict[str, Any], layout: Any = None) -> None:
+        """Refuse a view that an environment of gym:<id>, with a `layout`, has not."""
+        check_view(self.skill_observation, layout)
 
     @property
     def num_envs(self) -> int:
@@ -188,9 +197,10 @@ class OptionCriticConfig:
 def make_policy(config: OptionCriticConfig, envs: Any, generator: torch.Generator) -> OptionPolicy:
     """Freshly drawn networks for these environments."""
     obs_size = envs.single_observation_space.shape[0]
+    ego = Ego(envs.observation_names[: envs.robot_size]) if config.skill_observation == "ego" else None
     policy = OptionPolicy(
         obs_size,
-        envs.robot_size if config.skill_observation == "robot" else obs_size,
+        {"robot": envs.robot_size, "full": obs_size}[config.skill_observation] if ego is None else ego.size,
         envs.single_action_space.shape[0],
         config.num_skills,
         config.skill_hidden_sizes,
@@ -202,6 +212,7 @@ def make_policy(config: OptionCriticConfig, envs: Any, generator: torch.Generato
         config.log_std_per_skill,
         config.termination_bias,
     )
+    policy.skills.ego = ego
     if config.initialisation == "normc":
         normalize_columns([policy.skills.first, *policy.skills.rest.layers], POLICY_HEAD, generator)
         normalize_columns(policy.manager.logits.layers, POLICY_HEAD, generator)
@@ -339,7 +350,7 @@ def improve(
     epochs, clip_range = config.updates, config.clip_range
 
     def log_prob(c: Rows) -> Tensor:
-        return policy.skills.log_prob(data.seen[c, : policy.robot_size], data.option[c], data.action[c])
+        return policy.skills.log_prob(policy.skills.see(data.seen[c]), data.option[c], data.action[c])
 
     level = Level("skill", log_prob, data.advantage)
     parts = rows // size if size else 1
@@ -385,7 +396,6 @@ def improve_as_ppoc(
     pushed at every step by the advantages of actions, with the log-probability of the minibatch's first state only.
     """
     parameters = [p for group in optimizer.param_groups for p in group["params"]]
-    robot = policy.robot_size
 
     def step(loss: Tensor, learning_rate: float) -> None:
         gradients = torch.autograd.grad(loss, parameters, allow_unused=True, materialize_grads=True)
@@ -395,7 +405,7 @@ def improve_as_ppoc(
         optimizer.step()
 
     with torch.no_grad():
-        old = policy.skills.log_prob(data.seen[:, :robot], data.option, data.action)
+        old = policy.skills.log_prob(policy.skills.see(data.seen), data.option, data.action)
     for option in range(policy.num_options):
         rows = (data.option == option).nonzero().squeeze(-1)
         size = config.minibatch_size
@@ -410,7 +420,7 @@ def improve_as_ppoc(
                 (policy.beta(seen)[:, option] * (q[:, option] - value + config.switching_cost)).sum(),
                 PPOC_TERMINATION_STEP,
             )
-            log_prob = policy.skills.log_prob(seen[:, :robot], data.option[i], data.action[i])
+            log_prob = policy.skills.log_prob(policy.skills.see(seen), data.option[i], data.action[i])
             policy_loss = -clipped_surrogate(log_prob, old[i], advantage, config.clip_range).mean()
             critic_loss = (policy.critic(seen)[:, option] - data.returns[i]).square().mean()
             log_pi = policy.manager.log_probs(seen)
@@ -425,7 +435,7 @@ def log_probs(policy: OptionPolicy, data: Portion) -> tuple[Tensor, Tensor]:
     """Log-probabilities of the actions taken (B,), and of the options chosen at decisions."""
 
     def of_action(c: slice) -> Tensor:
-        return policy.skills.log_prob(data.seen[c, : policy.robot_size], data.option[c], data.action[c])
+        return policy.skills.log_prob(policy.skills.see(data.seen[c]), data.option[c], data.action[c])
 
     seen, choice = data.seen[data.is_decision], data.option[data.is_decision]
     return in_chunks(of_action, len(data.option)), of_option(policy.manager.log_probs(seen), choice)

@@ -25,7 +25,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from experiments import synonyms
 from hippo.core.settings import ConfigError, setting
-from hippo.core.skills import SkillsError, read_skills
+from hippo.core.skills import SkillsError, read_skills, view_of
 from hippo.envs import ENVIRONMENTS, environment, foreign
 from hippo.envs.arguments import Refused
 from hippo.envs.foreign import ForeignOptions
@@ -196,6 +196,7 @@ class Run:
         robot = environment(self.env).robot
         shared = {name: getattr(self.config, name) for name in SHARED_WITH_SKILLS if hasattr(self.config, name)}
         overrides = [f"algo.{name}={json.dumps(value)}" for name, value in shared.items()]
+        overrides += ["algo.skill_observation=ego"] * (getattr(self.config, "skill_observation", "") == "ego")
         overrides += [f"env.{name}={value}" for name, value in self.options.items() if name == "observation"]
         chosen = [f"env={robot}", f"algo={PRETRAINING[robot]}", f"scale={self.scale}"]
         return compose_run([*chosen, *overrides], self.runs_dir)
@@ -503,9 +504,11 @@ def _check_skills(path: str, env: dict[str, Any], settings: dict[str, Any]) -> N
         raise ConfigError("algo.skills", path, f"must be {PRETRAINED} or a skills file ({error})") from error
     wanted = {"robot": environment(env["name"]).robot, "observation": env["observation"]}
     wanted |= {name.removeprefix("skill_"): settings[name] for name in SHARED_WITH_SKILLS if name in settings}
+    if "skill_observation" in settings:  # HIRO, which has no skills of its own, takes either
+        wanted["view"] = "ego" if settings["skill_observation"] == "ego" else "robot"
     for key, value in wanted.items():
-        if metadata[key] != value:
-            raise ConfigError("algo.skills", path, f"has {key} {metadata[key]}, this run needs {value}")
+        if (has := view_of(metadata) if key == "view" else metadata[key]) != value:
+            raise ConfigError("algo.skills", path, f"has {key} {has}, this run needs {value}")
 
 
 def _validated(config: DictConfig, algo: str, names: dict[str, str]) -> Run:

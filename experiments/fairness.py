@@ -113,13 +113,13 @@ class Untrained(Checkpoint):
 def acting_parameters(run: Run) -> int:
     """Numbers in the networks that act: no critics, no targets."""
     envs = make(run.env, 1, 0, **run.options)
-    policy: nn.Module = learner_of(run.algo).restored(run.restored_config, envs, Untrained())
+    policy: Any = learner_of(run.algo).restored(run.restored_config, envs, Untrained())
     envs.close()
-    parts = [policy]
+    parts: list[nn.Module] = [policy]
     if run.algo == "hiro":
-        parts = [policy.low.actor, policy.manager.actor]  # type: ignore[union-attr]
+        parts = [policy.low.actor, policy.manager.actor]
     if run.algo == "option_critic":
-        parts = [policy.skills, policy.manager, policy.termination]  # type: ignore[list-item]
+        parts = [policy.skills, policy.manager, policy.termination]
     return sum(p.numel() for part in parts for p in part.parameters())
 
 

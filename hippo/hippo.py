@@ -73,7 +73,7 @@ def train(config: HippoConfig, make_envs: MakeEnvs, log: RunLog, seed: int, chec
     envs = make_envs(config.num_envs, "training")
     obs_size, action_size = envs.single_observation_space.shape[0], envs.single_action_space.shape[0]
     generator = seeding.torch_generator(seed, "initialisation")
-    policy = HierarchicalPolicy(config, obs_size, envs.robot_size, action_size, generator)
+    policy = HierarchicalPolicy(config, obs_size, envs.robot_size, action_size, generator, envs.observation_names)
     start_from(config.skills, policy.skills, envs)
     baselines = Baselines(config, obs_size, generator, in_loop=config.values_in_loop)
     # A frozen level stays out of the optimiser, log-std included.

@@ -24,6 +24,7 @@ from hippo.core.policies import POLICY_HEAD, Manager, SkillPolicy, gaussian_entr
 from hippo.core.ppo import Level, Rows
 from hippo.core.rollout import Steps
 from hippo.core.settings import MOST_SKILLS, WIDEST, ConfigError, setting
+from hippo.core.view import Ego, check_view
 
 
 @dataclass
@@ -73,10 +74,10 @@ class HierarchyConfig(OnPolicyConfig):
     )
     skill_observation: str = setting(
         "robot",
-        "what skills see: the robot's own observation or everything",
+        "what skills see: the robot's own observation, the same free of place and heading (ego), or everything",
         paper="pi(a|s, z), silent",
         code="robot (test2_hier_snn_mlp_policy.py:180)",
-        choices=("robot", "full"),
+        choices=("robot", "ego", "full"),
     )
     log_std_per_skill: bool = setting(
         False, "one log-std vector per skill instead of a shared one", code="shared (test2_hier_snn_mlp_policy.py:226)"
@@ -103,6 +104,13 @@ class HierarchyConfig(OnPolicyConfig):
         if self.skills and self.normalize_observations:
             valid = "is a file of skills that see observations as they are: needs normalize_observations=false"
             raise ConfigError("skills", self.skills, valid)
+        if self.skill_observation == "ego" and self.normalize_observations:
+            valid = "turns observations as they are: needs normalize_observations=false"
+            raise ConfigError("skill_observation", "ego", valid)
+
+    def check_environment(self, robot: str, options: dict[str, Any], layout: Any = None) -> None:
+        """Refuse a view that an environment of gym:<id>, with a `layout`, has not."""
+        check_view(self.skill_observation, layout)
 
 
 def with_time(obs: Tensor, time_left: Tensor) -> Tensor:
@@ -115,15 +123,25 @@ class HierarchicalPolicy(nn.Module):
 
     Only with a random period do the two see the time left (authors' code: fixed-p networks do not). Observations are
     those that `collect` records: where the policy has a filter, they have passed it.
+
+    Args:
+        names: of an observation's entries, which `skill_observation=ego` goes by.
     """
 
     def __init__(
-        self, config: HierarchyConfig, obs_size: int, robot_size: int, action_size: int, generator: torch.Generator
+        self,
+        config: HierarchyConfig,
+        obs_size: int,
+        robot_size: int,
+        action_size: int,
+        generator: torch.Generator,
+        names: Sequence[str] = (),
     ) -> None:
         super().__init__()
         self.num_skills = config.num_skills
         self.filter = ObservationFilter(obs_size) if config.normalize_observations else None
-        self.skill_view = robot_size if config.skill_observation == "robot" else obs_size
+        ego = Ego(names[:robot_size]) if config.skill_observation == "ego" else None
+        self.skill_view = {"robot": robot_size, "full": obs_size}[config.skill_observation] if ego is None else ego.size
         self.sees_time = config.period_min < config.period_max
         extra = int(self.sees_time)
         self.manager = Manager(obs_size + extra, config.num_skills, config.manager_hidden_sizes, generator)
@@ -136,6 +154,7 @@ class HierarchicalPolicy(nn.Module):
             config.skill_integration,
             config.log_std_per_skill,
         )
+        self.skills.ego = ego
         if config.initialisation == "normc":
             normalize_columns(self.manager.logits.layers, POLICY_HEAD, generator)
             normalize_columns([self.skills.first, *self.skills.rest.layers], POLICY_HEAD, generator)
@@ -146,7 +165,7 @@ class HierarchicalPolicy(nn.Module):
 
     def skill_input(self, obs: Tensor, time_left: Tensor) -> Tensor:
         """(..., D), (...) -> (..., robot [+ 1])."""
-        view = obs[..., : self.skill_view]
+        view = obs[..., : self.skill_view] if self.skills.ego is None else self.skills.ego(obs)
         return with_time(view, time_left) if self.sees_time else view
 
 
@@ -278,8 +297,9 @@ class Acting(OfHorizons):
 
     def action(self) -> np.ndarray:
         """What the skills in force do (N, A) about what was last seen."""
-        policy, time_left = self.policy, self.commitment.time_left
-        seen = look(self._seen, time_left, self._everywhere, policy.skill_view, policy.sees_time)
+        policy, time_left, ego = self.policy, self.commitment.time_left, self.policy.skills.ego
+        whole = self._seen if ego is None else ego.of_array(self._seen)
+        seen = look(whole, time_left, self._everywhere, policy.skill_view, policy.sees_time)
         return self._skills(seen, self.skill, self._noise[self._t])
 
     def act(self, obs: np.ndarray) -> np.ndarray:
@@ -333,7 +353,7 @@ def restored(config: HierarchyConfig, envs: Any, checkpoint: Checkpoint) -> Hier
     """The policy of a checkpoint."""
     obs_size, action_size = envs.single_observation_space.shape[0], envs.single_action_space.shape[0]
     generator = seeding.torch_generator(0, "overwritten by the checkpoint")
-    policy = HierarchicalPolicy(config, obs_size, envs.robot_size, action_size, generator)
+    policy = HierarchicalPolicy(config, obs_size, envs.robot_size, action_size, generator, envs.observation_names)
     checkpoint.restore(policy=policy)
     return policy
 

@@ -24,6 +24,7 @@ from hippo.core.ppo import Level, Rows, maximize
 from hippo.core.rollout import LastInfo, Steps
 from hippo.core.settings import MOST_SKILLS, MOST_STEPS, WIDEST, ConfigError, check, setting
 from hippo.core.value import ValueFunction, explained_variance
+from hippo.core.view import Ego
 
 
 @dataclass
@@ -57,6 +58,13 @@ class PretrainingConfig:
     )
     log_std_per_skill: bool = setting(
         False, "one log-std vector per skill instead of a shared one", code="shared (snn_mlp_policy.py)"
+    )
+    skill_observation: str = setting(
+        "robot",
+        "what skills see: the robot's own observation, or the same free of place and heading (ego)",
+        code="SNN: ego_obs of the authors' robots (train_snn_ant.py); DIAYN: without x",
+        ours="robot: the committed skills'",
+        choices=("robot", "ego"),
     )
     learning_rate: float = setting(3e-3, "Adam step size", ours="HiPPO's; the originals use TRPO and SAC", above=0.0)
     clip_range: float = setting(0.1, "clipping parameter epsilon", ours="HiPPO's; the originals do not clip", above=0.0)
@@ -122,12 +130,12 @@ def collect(
     next_obs, position = np.empty((T, *steps.obs.shape[1:]), np.float32), np.empty((T + 1, N, 3))
     next_position = np.empty((T, N, 3))
 
-    act, size = policy.actor(), policy.first.inputs
+    act = policy.actor()
     obs = steps.reset(seeding.integer(seed, "episodes", iteration))
     active[0], begun, position[0] = drawn[0], np.zeros(N, np.int64), envs.com
     for t in range(T):
         start[t] = begun
-        obs, done = steps.step(t, act(obs[:, :size], active[t], noise[t]))
+        obs, done = steps.step(t, act(policy.see_array(obs), active[t], noise[t]))
         next_obs[t], next_position[t], position[t + 1] = obs, tapped.info["com"], envs.com
         if done.any():
             next_obs[t][done] = tapped.info["final_obs"][done]
@@ -206,10 +214,10 @@ def update(
 ) -> dict[str, float]:
     """HiPPO's clipped surrogate on the advantages of `reward` (T, N), then a new fit of V(s, z); returns metrics."""
     steps, skill = paths.steps, paths.skill
-    obs = steps.obs[..., : policy.first.inputs]
+    obs = policy.see(steps.obs)
     final_obs, step, env = steps.final()
     value = baseline.predict(obs, skill)
-    final_value = baseline.predict(final_obs[..., : policy.first.inputs], skill[step, env])
+    final_value = baseline.predict(policy.see(final_obs), skill[step, env])
     next_value = value[1:].index_put((step, env), final_value)
     advantage = gae(reward, value[:-1], next_value, steps.terminated, steps.done, config.gamma, config.gae_lambda)
     target, order = advantage + value[:-1], skill[:-1].flatten().argsort(stable=True)  # rows sorted by skill
@@ -241,8 +249,9 @@ def skill_statistics(policy: SkillPolicy, paths: Paths) -> dict[str, float]:
 
 def new_policy(config: PretrainingConfig, envs: Any, generator: torch.Generator) -> SkillPolicy:
     """The skill network that a hierarchy with a fixed period has for the robot of `envs`."""
-    return SkillPolicy(
-        envs.robot_size,
+    ego = Ego(envs.observation_names[: envs.robot_size]) if config.skill_observation == "ego" else None
+    policy = SkillPolicy(
+        envs.robot_size if ego is None else ego.size,
         config.num_skills,
         envs.single_action_space.shape[0],
         config.skill_hidden_sizes,
@@ -250,6 +259,8 @@ def new_policy(config: PretrainingConfig, envs: Any, generator: torch.Generator)
         config.skill_integration,
         config.log_std_per_skill,
     )
+    policy.ego = ego
+    return policy
 
 
 def trained_skills(
@@ -266,6 +277,8 @@ def trained_skills(
         "algo": algo,
         "env_steps": iterations * config.num_envs * config.horizon,
         "physics": envs.options.physics,
+        "view": config.skill_observation,
+        "names": list(envs.observation_names[: envs.robot_size]),
     }
     envs.close()
     return policy, metadata
