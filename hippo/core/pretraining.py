@@ -79,6 +79,14 @@ class PretrainingConfig:
     value_hidden_sizes: list[int] = setting(
         [32, 32], "hidden layers of the baseline V(s, z)", ours="HiPPO's", low=1, high=WIDEST
     )
+    value_sees_time: bool = setting(
+        False, "whether V(s, z) also sees which share of a path has passed", ours="no; a path's return depends on it"
+    )
+    standardize_per_skill: bool = setting(
+        False,
+        "standardise advantages over the steps of each skill instead of over all",
+        ours="no; with it no skill's bonus drowns in another's",
+    )
     value_iterations: int = setting(10, "the most loss evaluations of a fit of the baseline", ours="HiPPO's", low=1)
 
     def __post_init__(self) -> None:
@@ -167,7 +175,8 @@ def train_skills(
     """
     generator = seeding.torch_generator(seed, "initialisation")
     policy = new_policy(config, envs, generator)
-    baseline = ValueFunction(policy.first.inputs, config.value_hidden_sizes, generator, config.num_skills)
+    inputs = policy.first.inputs + config.value_sees_time
+    baseline = ValueFunction(inputs, config.value_hidden_sizes, generator, config.num_skills)
     optimizer = Adam(policy.parameters(), lr=config.learning_rate)
     parts = {"policy": policy, "baseline": baseline, "optimizer": optimizer} | objective.parts
     first = checkpoint.restore(**parts)
@@ -216,8 +225,14 @@ def update(
     steps, skill = paths.steps, paths.skill
     obs = policy.see(steps.obs)
     final_obs, step, env = steps.final()
-    value = baseline.predict(obs, skill)
-    final_value = baseline.predict(policy.see(final_obs), skill[step, env])
+    valued, final_valued = obs, policy.see(final_obs)
+    if config.value_sees_time:
+        passed = share_passed(paths)
+        valued = torch.cat([obs, passed.unsqueeze(-1).to(obs.dtype)], -1)
+        after = passed[step, env] + 1 / len(paths.start)  # what follows a path's last step is still of that path
+        final_valued = torch.cat([final_valued, after.unsqueeze(-1).to(obs.dtype)], -1)
+    value = baseline.predict(valued, skill)
+    final_value = baseline.predict(final_valued, skill[step, env])
     next_value = value[1:].index_put((step, env), final_value)
     advantage = gae(reward, value[:-1], next_value, steps.terminated, steps.done, config.gamma, config.gae_lambda)
     target, order = advantage + value[:-1], skill[:-1].flatten().argsort(stable=True)  # rows sorted by skill
@@ -227,11 +242,23 @@ def update(
     def log_prob(c: Rows) -> Tensor:
         return policy.log_prob(rows[c], active[c], action[c])
 
-    level = Level("skill", log_prob, standardize(advantage).flatten()[order].to(rows.dtype))
+    standardized = standardize(advantage).flatten()[order]
+    if config.standardize_per_skill:
+        counts = torch.bincount(active, minlength=policy.num_skills).tolist()
+        standardized = torch.cat([standardize(a) for a in advantage.flatten()[order].split(counts) if len(a)])
+    level = Level("skill", log_prob, standardized.to(rows.dtype))
     losses = maximize([level], optimizer, config.updates, config.clip_range, steps.num_steps)
     explained = explained_variance(value[:-1].flatten(), target.flatten())
-    baseline.fit(rows, target.flatten()[order], config.value_iterations, active)
+    baseline.fit(valued[:-1].flatten(0, 1)[order], target.flatten()[order], config.value_iterations, active)
     return losses | {"skill_explained_variance": explained}
+
+
+def share_passed(paths: Paths) -> Tensor:
+    """Share of a whole path that has passed where each row begins, (T + 1, N) in [0, 1]; 0 where a path begins."""
+    T = len(paths.start)
+    passed = torch.arange(T).unsqueeze(1) - paths.start
+    last = torch.where(paths.steps.done[-1], 0, passed[-1] + 1)
+    return torch.cat([passed, last.unsqueeze(0)]).double() / T
 
 
 def skill_statistics(policy: SkillPolicy, paths: Paths) -> dict[str, float]:
