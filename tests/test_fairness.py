@@ -4,12 +4,12 @@ from collections import Counter
 from types import SimpleNamespace
 
 import pytest
-import torch
 
 from baselines import mlsh, option_critic, ppo
 from experiments import fairness
 from experiments.config import compose_run
 from hippo import hippo
+from hippo.core.optimizers import Adam
 from tests.toy import run
 
 
@@ -58,13 +58,13 @@ SMALL = {"iterations": 7, "batch_size": 120, "horizon": 40, "num_skills": 2}
     ],
 )
 def test_gradient_steps_are_those_that_a_run_takes(algo, module, config, rates, tmp_path, monkeypatch):
-    taken, step = Counter(), torch.optim.Adam.step
+    taken, step = Counter(), Adam.step
 
     def counted(self, *arguments):
         taken[self.param_groups[0]["lr"]] += 1
         return step(self, *arguments)
 
-    monkeypatch.setattr(torch.optim.Adam, "step", counted)
+    monkeypatch.setattr(Adam, "step", counted)
     run(module.train, config, tmp_path)
     steps = fairness.gradient_steps(SimpleNamespace(algo=algo, config=config))
     assert steps == {level: taken[rate] for level, rate in rates.items()}
