@@ -4,6 +4,7 @@ The sentences stand in claims.yaml, what each compares in predicates.py, how a v
 them are listed, with the state of every place that they name; seeds below three decide nothing.
 """
 
+import dataclasses
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,7 +14,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from analysis import verdicts
+from analysis import predicates, verdicts
 from analysis.command_line import ROOT, bad_input, parser
 from analysis.edition import PAPER, chosen
 from analysis.predicates import KINDS, Kind, Pairs, Printed, Spec
@@ -56,8 +57,20 @@ CLAIMS = tuple(Claim(**entry) for entry in yaml.safe_load(Path(__file__).with_na
 
 
 def judge(claim: Claim, results: Results) -> Ruling:
-    """The verdict on a claim; places with fewer than three seeds on a side are left out and show nothing."""
-    pairs = claim.kind.pairs(claim.compare, results)
+    """The verdict on a claim; places with fewer than three seeds on a side are left out and show nothing.
+
+    Where one side has a smaller budget than the other, as HIRO has, a second one reads both where that budget ends.
+    """
+    ruling = _judge(claim, claim.kind.pairs(claim.compare, results))
+    shorter = predicates.shorter_side(claim.compare, results) if claim.kind.of_curves else None
+    if shorter is None:
+        return ruling
+    early = _judge(claim, claim.kind.pairs(claim.compare | {"common_steps": True}, results))
+    where = f"at the {shorter[1] / 1e6:.3g} M steps of {shorter[0]}"
+    return dataclasses.replace(ruling, at=where, at_these_steps=early)
+
+
+def _judge(claim: Claim, pairs: Pairs) -> Ruling:
     enough = {place: both for place, both in pairs.items() if min(map(len, both)) >= FEWEST_SEEDS}
     notable = verdicts.NOTABLE if claim.kind.notable(claim.compare) else 0.0
     comparisons = {place: verdicts.compare(*both, notable) for place, both in enough.items()}
@@ -100,14 +113,21 @@ def ruled(claim: Claim, results: Results | None, paper: dict[str, Any]) -> Rulin
 
 def in_words(ruling: Ruling) -> str:
     """Every place with its difference, its 90 % interval and its own verdict."""
-    return "; ".join(
+    words = "; ".join(
         f"{place} {c.mean:+.3g} [{c.low:.3g}, {c.high:.3g}] n = {c.seeds[0]}, {c.seeds[1]}: {c.verdict}"
         for place, c in ruling.comparisons.items()
     )
+    return words if ruling.at_these_steps is None else f"{words}; {ruling.at}: {in_words(ruling.at_these_steps)}"
 
 
 def verdict_of(ruling: Ruling) -> str:
-    """The verdict with its reason; where some places were not trained, with those of the others."""
+    """The verdict with its reason; where some places were not trained, with those of the others.
+
+    Where budgets differ, that at the smaller one stands behind.
+    """
+    if ruling.at_these_steps is not None:
+        alone = dataclasses.replace(ruling, at_these_steps=None)
+        return f"{verdict_of(alone)}; {ruling.at}: {verdict_of(ruling.at_these_steps)}"
     if ruling.verdict != UNDECIDABLE or len(ruling.comparisons) > MOST_PLACES:
         return ruling.verdict + (f" ({ruling.why})" if ruling.why else "")
     by_place = ", ".join(f"{place} {c.verdict}" for place, c in ruling.comparisons.items())
@@ -165,7 +185,9 @@ def lines(scale: str, runs_dir: Path, data_dir: Path, protocol: str = PAPER) -> 
         "|---|---|---|---|---|---|---|",
     ]
     for claim, ruling in zip(CLAIMS, rulings, strict=True):
-        words = (ruling.verdict, ruling.why, in_words(ruling), own_numbers(claim, paper))
+        early = f"{ruling.at}: {verdict_of(ruling.at_these_steps)}" if ruling.at_these_steps else ""
+        why = "; ".join(part for part in (ruling.why, early) if part)
+        words = (ruling.verdict, why, in_words(ruling), own_numbers(claim, paper))
         out.append(f"| {' | '.join((claim.name, claim.source, claim.sentence, *words))} |")
     return [*out, "", "The rule and its error rates: docs/verdicts.md."]
 

@@ -1,7 +1,8 @@
 """What each kind of sentence in claims.yaml compares: scores per seed of the favoured and the other side, by place.
 
 A place is an environment, a cell of Table 1 or a setting of Table 2. "Faster" is the area under the curve to the common
-budget, "final" the mean of the last 10 % of iterations. Every kind that can be is also run on the paper's own numbers.
+budget, "final" the mean of the last 10 % of iterations (whole cycles, where a method starts over: analysis/stats.py).
+Every kind that can be is also run on the paper's own numbers.
 """
 
 from collections.abc import Callable
@@ -22,6 +23,7 @@ ALMOST_ONE = 0.9  # what "almost 1" is taken to mean; the paper's own cells are 
 ORDER_OF_A_TENTH = (10**-1.5, 10**-0.5)
 NEGLECTED, EXPONENT = 10**-9.5, 9  # 10^-10 to the nearest power of ten; p - 1 at p = 10
 EARLY = 0.2  # share of the common budget that "initially" means
+SAME_BUDGET = 0.95  # share of the other's environment steps from which two budgets count as one
 SAME_SIZE = 1.25  # factor within which networks have "roughly the same" number of parameters
 Spec = dict[str, Any]  # `compare` of a claim
 Scores = tuple[np.ndarray, np.ndarray]  # per seed: favoured, other
@@ -46,6 +48,7 @@ class Kind:
     pairs: Callable[[Spec, Results], Pairs]
     printed: Callable[[Spec, str | None, dict[str, Any]], Printed | None]  # of the claim's figure; paper_values.yaml
     notable: Callable[[Spec], bool] = lambda spec: False  # whether "above" promises more than any difference at all
+    of_curves: bool = False  # compares ends of learning curves, which depend on where they are read
 
 
 def environments(spec: Spec) -> tuple[str, ...]:
@@ -74,53 +77,89 @@ def complete_curves(results: Results, env: str, variant: str) -> list[np.ndarray
     return [run.sort_values("env_steps")[["env_steps", "value"]].to_numpy(float) for _, run in frame.groupby("seed")]
 
 
-def final(curve: np.ndarray) -> float:
+def cycle_of(results: Results, env: str, variant: str, curves: list[np.ndarray]) -> int:
+    """Rows after which the method starts over, 1 for one that never does."""
+    return results.rows_per_cycle(env, variant, curves[0][0, 0]) if curves else 1
+
+
+def final(curve: np.ndarray, cycle: int = 1) -> float:
     """Mean of the last 10 % of iterations."""
-    return float(stats.final_performance(curve[:, 1]))
+    return float(stats.final_performance(curve[:, 1], cycle))
 
 
-def gain(curve: np.ndarray) -> float:
+def gain(curve: np.ndarray, cycle: int = 1) -> float:
     """Mean of the last 10 % of iterations less that of the first 10 %."""
-    return final(curve) - float(stats.final_performance(curve[::-1, 1]))
+    return final(curve, cycle) - float(stats.initial_performance(curve[:, 1], cycle))
 
 
-def steadiness(curve: np.ndarray) -> float:
+def steadiness(curve: np.ndarray, cycle: int = 1) -> float:
     """Final performance less the best mean over as many iterations in a row; 0 where nothing was lost again."""
-    width = max(1, round(0.1 * len(curve)))
+    width = stats.window(len(curve), cycle)
     windows = np.lib.stride_tricks.sliding_window_view(curve[:, 1], width).mean(1)
-    return final(curve) - float(windows.max())
+    return final(curve, cycle) - float(windows.max())
 
 
-PER_CURVE: dict[str, Callable[[np.ndarray], float]] = {"final": final, "gain": gain, "steadiness": steadiness}
+PER_CURVE: dict[str, Callable[[np.ndarray, int], float]] = {"final": final, "gain": gain, "steadiness": steadiness}
 AREAS = {"area": 1.0, "early": EARLY}  # share of the common budget
 
 
-def curve_scores(results: Results, env: str, variants: tuple[str, str], measure: str) -> Scores:
-    """Per seed of both variants, a measure of PER_CURVE or an area (the mean height up to the common budget)."""
+def curve_scores(
+    results: Results, env: str, variants: tuple[str, str], measure: str, common_steps: bool = False
+) -> Scores:
+    """Per seed of both variants, a measure of PER_CURVE or an area (the mean height up to the common budget).
+
+    Args:
+        common_steps: curves end where the shortest of them does, as areas always do.
+    """
     curves = [complete_curves(results, env, variant) for variant in variants]
+    cycles = [cycle_of(results, env, variant, of) for variant, of in zip(variants, curves, strict=True)]
     both = [curve for of in curves for curve in of]
     if not both:
         return np.array([]), np.array([])
-    if measure in PER_CURVE:
-        x, y = (np.array([PER_CURVE[measure](curve) for curve in of]) for of in curves)
-        return x, y
     start, budget = max(curve[0, 0] for curve in both), min(curve[-1, 0] for curve in both)
-    grid = np.linspace(start, start + AREAS[measure] * (budget - start), 1000)
+    if measure in PER_CURVE:
+        end = max(start, budget) if common_steps else np.inf
+        x, y = (
+            np.array([PER_CURVE[measure](curve[curve[:, 0] <= end], cycle) for curve in of])
+            for of, cycle in zip(curves, cycles, strict=True)
+        )
+        return x, y
+    end = start + AREAS[measure] * (budget - start)
+    for of, cycle in zip(curves, cycles, strict=True):
+        if cycle > 1 and of and (steps := of[0][min(cycle, len(of[0])) - 1, 0]) <= budget:
+            end = steps * min(max(1, round(end / steps)), budget // steps)
+    grid = np.linspace(start, end, 1000)
     x, y = (np.array([np.interp(grid, curve[:, 0], curve[:, 1]).mean() for curve in of]) for of in curves)
     return x, y
+
+
+def shorter_side(spec: Spec, results: Results) -> tuple[str, float] | None:
+    """The side that has notably fewer environment steps than the other and their number, None where none has."""
+    if spec.get("measure", "gain") not in PER_CURVE or "other" not in spec:
+        return None
+    for env in environments(spec):
+        ends = {}
+        for variant in (spec["favoured"], spec["other"]):
+            if curves := complete_curves(results, env, variant):
+                ends[variant] = min(curve[-1, 0] for curve in curves)
+        if len(ends) == 2 and min(ends.values()) < SAME_BUDGET * max(ends.values()):
+            shorter = min(ends, key=lambda variant: ends[variant])
+            return shorter, ends[shorter]
+    return None
 
 
 def margin(spec: Spec, results: Results, env: str) -> float:
     """How far the favoured side may be off: a share of the other's mean final performance, whose noise is left out."""
     curves = complete_curves(results, env, spec["other"])
-    return spec["margin"] * abs(float(np.mean([final(curve) for curve in curves]))) if curves else 0.0
+    cycle = cycle_of(results, env, spec["other"], curves)
+    return spec["margin"] * abs(float(np.mean([final(curve, cycle) for curve in curves]))) if curves else 0.0
 
 
 def curve(spec: Spec, results: Results) -> Pairs:
     """The favoured method is above the other, or at most a margin, a share of the other's mean, below it."""
     pairs = {}
     for env in environments(spec):
-        x, y = curve_scores(results, env, (spec["favoured"], spec["other"]), spec["measure"])
+        x, y = curve_scores(results, env, (spec["favoured"], spec["other"]), spec["measure"], "common_steps" in spec)
         pairs[env] = (x, y * (1 - spec.get("margin", 0.0) * np.sign(y.mean())) if len(y) else y)
     return pairs
 
@@ -162,7 +201,7 @@ def fails(spec: Spec, results: Results) -> Pairs:
     """The other method gains less than a share of what the favoured one does."""
     pairs = {}
     for env in environments(spec):
-        x, y = curve_scores(results, env, (spec["favoured"], spec["other"]), "gain")
+        x, y = curve_scores(results, env, (spec["favoured"], spec["other"]), "gain", "common_steps" in spec)
         pairs[env] = (spec["share"] * x, y)
     return pairs
 
@@ -283,10 +322,10 @@ def parameters(_spec: Spec, _figure: str | None, paper: dict[str, Any]) -> Print
 
 
 KINDS = {
-    "curve": Kind(environments, curve, printed_curve, lambda spec: "margin" not in spec),
+    "curve": Kind(environments, curve, printed_curve, lambda spec: "margin" not in spec, of_curves=True),
     "same": Kind(same_places, same, nothing_printed),
     "learns": Kind(environments, learns, nothing_printed),
-    "fails": Kind(environments, fails, nothing_printed),
+    "fails": Kind(environments, fails, nothing_printed, of_curves=True),
     "variance": Kind(environments, variance, nothing_printed, lambda spec: True),
     "change": Kind(cells, change, printed_change, lambda spec: not spec["relative"]),
     "quantity": Kind(settings, quantity, printed_quantity),

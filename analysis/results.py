@@ -31,7 +31,7 @@ been trained. `python -m analysis.explain paper_figures/data/laptop/fig3.csv` li
 """
 NUMBERS = """Final: return over the last 10 % of iterations, mean ± standard deviation over seeds. Gain: that less the
 first 10 %, for methods do not start alike. Area: mean return over all iterations. The pictures' curves are smoothed
-([reproduce.md](reproduce.md)), the numbers are not.
+([reproduce.md](reproduce.md)), the numbers are not; MLSH's are of whole cycles.
 """
 MARK = re.compile(r"(<!-- verdicts -->\n).*?(<!-- end -->)", re.DOTALL)
 CALLED = {PAPER: "as printed"}  # protocols, in the table of verdicts
@@ -46,9 +46,10 @@ def performance(results: Results, env: str) -> list[str]:
         if not seeds:
             continue
         curves = [table[seed].dropna().to_numpy() for seed in seeds]
-        final = np.array([stats.final_performance(curve) for curve in curves])
-        gain = final - [stats.final_performance(curve[::-1]) for curve in curves]
-        area = np.array([curve.mean() for curve in curves])
+        cycle = results.rows_per_cycle(env, variant, steps[0])
+        final = np.array([stats.final_performance(curve, cycle) for curve in curves])
+        gain = final - [stats.initial_performance(curve, cycle) for curve in curves]
+        area = np.array([stats.whole_cycles(curve, cycle).mean() for curve in curves])
         cells = " | ".join(map(stats.with_deviation, (final, gain, area)))
         row = f"| {label[variant]} | {len(seeds)} | {steps[-1] / 1e6:.1f} M | {cells} |"
         rows.append((-final.mean(), row))

@@ -7,6 +7,7 @@ edition.py says where those of another protocol, and of figures with overrides, 
 import functools
 import hashlib
 import io
+import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -31,6 +32,7 @@ PLANNED: dict[str, type | tuple[type, ...]] = {
     **dict.fromkeys(("run_id", "env", "env_label", "variant", "variant_label", "physics", "kind", "state"), str),
     **dict.fromkeys(("seed", "iterations", "batch_size"), int),
 }
+LATER = {"cycle": int, "env_steps": int}  # what plans written by older code do not say
 COLUMNS = ["figure", "scale", "env", "variant", "seed", "run_id", "env_steps", "metric", "value"]
 
 
@@ -83,6 +85,19 @@ class Results:
         rows = self.frame[self.frame["metric"] == "return_mean"]
         counts = rows.groupby(["env", "variant"])["seed"].nunique().reset_index()
         return {(env, variant): int(n) for env, variant, n in counts.itertuples(index=False)}
+
+    def rows_per_cycle(self, env: str, variant: str, first_steps: float) -> int:
+        """Rows of a learning curve in which a method starts over once, 1 for one that never does (analysis/stats.py).
+
+        Args:
+            first_steps: environment steps at the curve's first row, by which a thinned curve is told.
+        """
+        same = (run for run in self.plan.get("runs", []) if (run["env"], run["variant"]) == (env, variant))
+        run = next((run for run in same if run.get("cycle", 1) > 1), None)
+        if run is None:
+            return 1
+        iterations_per_row = round(first_steps * run["iterations"] / run["env_steps"])
+        return max(1, run["cycle"] // max(1, iterations_per_row))
 
     def missing_lines(self) -> list[str]:
         """`missing` in words: a line per environment, and per seeds and state where these differ."""
@@ -187,6 +202,7 @@ def read_plan(path: Path) -> dict[str, Any]:
         raise DamagedFile(f"{path}: committed_in must be names of figures")
     for i, run in enumerate(plan["runs"]):
         check_object(path, run, PLANNED, f"runs[{i}]: ")
+        check_object(path, run, {key: kind for key, kind in LATER.items() if key in run}, f"runs[{i}]: ")
         for key, pattern in PATTERNS.items():
             if not pattern.fullmatch(run[key]):
                 raise DamagedFile(f"{path}: runs[{i}]: {key} {run[key]!r:.60} must match {pattern.pattern}")
@@ -301,3 +317,14 @@ def scores(
     chosen = chosen.assign(value=chosen["value"].where(np.isfinite(chosen["value"])))
     table = chosen.pivot_table(index="env_steps", columns="seed", values="value", dropna=False).sort_index()
     return list(table.columns), list(table.index), table
+
+
+def write_rows(frame: pd.DataFrame, path: Path) -> None:
+    """Write the rows of a figure as `frame.to_csv` does, but in half of its time: their words need no quotes."""
+    columns = [frame[name].to_numpy().tolist() for name in COLUMNS]
+    columns[-1] = ["" if math.isnan(value) else value for value in columns[-1]]
+    with path.open("w", newline="\n") as file:
+        file.write(",".join(COLUMNS) + "\n")
+        file.writelines(
+            f"{a},{b},{c},{d},{e},{f},{g},{h},{i}\n" for a, b, c, d, e, f, g, h, i in zip(*columns, strict=True)
+        )

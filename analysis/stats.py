@@ -107,7 +107,28 @@ def performance_profile(scores: np.ndarray, thresholds: np.ndarray) -> np.ndarra
     return (scores[..., None] > thresholds).mean(axis=tuple(range(scores.ndim)))
 
 
-def final_performance(curve: np.ndarray) -> np.ndarray:
+# A method that starts over every so many iterations (MLSH) has a saw-tooth for a curve, whose mean over a stretch
+# depends on where in a cycle the stretch falls. So every number of such a curve is of whole cycles. `cycle` is in rows,
+# 1 for all other methods; a curve that is shorter than one cycle is taken as it is.
+
+
+def whole_cycles(curve: np.ndarray, cycle: int = 1) -> np.ndarray:
+    """The curve without the cycle that its end cuts short: (..., T) -> (..., up to T)."""
+    rows = curve.shape[-1]
+    return curve[..., : rows // cycle * cycle or rows]
+
+
+def window(rows: int, cycle: int = 1) -> int:
+    """A tenth of a curve's rows, at least one, and of a saw-tooth the fewest whole cycles that hold as many."""
+    tenth = max(1, round(0.1 * rows))
+    return min(-(-tenth // cycle), rows // cycle) * cycle or tenth
+
+
+def final_performance(curve: np.ndarray, cycle: int = 1) -> np.ndarray:
     """Mean over the last 10 % of iterations, at least one: (S, T) -> (S,)."""
-    last = max(1, round(0.1 * curve.shape[-1]))
-    return curve[..., -last:].mean(axis=-1)
+    return whole_cycles(curve, cycle)[..., -window(curve.shape[-1], cycle) :].mean(axis=-1)
+
+
+def initial_performance(curve: np.ndarray, cycle: int = 1) -> np.ndarray:
+    """Mean over the first 10 % of iterations, at least one: (S, T) -> (S,)."""
+    return curve[..., : window(curve.shape[-1], cycle)].mean(axis=-1)

@@ -106,6 +106,8 @@ class Ruling:
     why: str
     comparisons: Mapping[str, Comparison]
     where_trained: str = ""  # verdict of the places that were trained, where others were not
+    at: str = ""  # where one side has fewer environment steps: whose, and how many
+    at_these_steps: "Ruling | None" = None  # what the data say if the other side is read there, too
 
 
 def rule(comparisons: Mapping[str, Comparison], places: tuple[str, ...], needed: int) -> Ruling:

@@ -37,11 +37,11 @@ from hippo.core.ppo import in_chunks
 from hippo.core.pretraining import Paths, PretrainingConfig, train_skills, trained_skills
 from hippo.core.settings import WIDEST, setting
 from hippo.core.training import MakeEnvs
+from hippo.core.view import ABSOLUTE
 
 __all__ = ["DIAYNConfig", "skills", "train"]
 
 REVISION = 1  # bumped by every change that alters the metrics of tests/golden
-ABSOLUTE = ("x", "y", "com_x", "com_y")  # entries that grow with the distance travelled
 
 
 @dataclass
@@ -149,7 +149,7 @@ class Distinguishable:
         """log pi(a|s, z) of every step, flat (T N,)."""
         steps, skill = paths.steps, paths.skill[:-1].flatten()
         order = skill.argsort(stable=True)
-        obs, action = steps.obs[:-1].flatten(0, 1)[order, : policy.first.inputs], steps.action.flatten(0, 1)[order]
+        obs, action = policy.see(steps.obs[:-1].flatten(0, 1)[order]), steps.action.flatten(0, 1)[order]
         active = skill[order]
         sorted_log_prob = in_chunks(lambda c: policy.log_prob(obs[c], active[c], action[c]), len(obs))
         return torch.empty_like(sorted_log_prob).index_copy_(0, order, sorted_log_prob)

@@ -24,7 +24,8 @@ from torch import nn
 from hippo.core import seeding
 from hippo.core.advantages import Baselines, advantages
 from hippo.core.checkpoint import Checkpoint
-from hippo.core.hierarchy import Acting, HierarchyConfig, collect, new_policy, restored
+from hippo.core.hierarchy import Acting, collect, new_policy, restored
+from hippo.core.hierarchy_config import HierarchyConfig
 from hippo.core.levels import levels, policy_statistics
 from hippo.core.log import RunLog, check_finite
 from hippo.core.optimizers import Adam

@@ -1,5 +1,6 @@
 """HIRO's two levels: what they see, how they act and learn, and a walk of both through environments."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -8,10 +9,11 @@ from torch import Tensor, nn
 
 from baselines.hiro_config import HiroConfig
 from hippo.core import seeding
-from hippo.core.goals import GOAL_SPACES, Goals, candidate_goals
+from hippo.core.goals import GOAL_SPACES, POSITION, Goals, candidate_goals
 from hippo.core.replay import Replay
 from hippo.core.rollout import LastInfo, Steps
 from hippo.core.td3 import TD3
+from hippo.core.view import ABSOLUTE
 
 EXPLORATION, TARGET_NOISE, TARGET_NOISE_CLIP = 1.0, 0.2, 0.5  # published, in the units of `noise_units`
 
@@ -20,12 +22,19 @@ class Agents(nn.Module):
     """The two levels: what they see, how they act, how they learn."""
 
     def __init__(
-        self, config: HiroConfig, goals: Goals, obs_size: int, action_size: int, generator: torch.Generator
+        self,
+        config: HiroConfig,
+        goals: Goals,
+        obs_size: int,
+        action_size: int,
+        generator: torch.Generator,
+        unseen: Sequence[int] = (),
     ) -> None:
         super().__init__()
         self.config, self.goals = config, goals
+        self.unseen = torch.tensor(unseen, dtype=torch.long)  # entries that neither level may know
         # With x and y in the goal only, the lower level cannot tell where it is, but where it should go (hiro_orig).
-        self.hidden = goals.index[:2] if config.goal_space == "both" else goals.index[:0]
+        self.hidden = goals.index[:2] if config.goal_space == "both" else self.unseen
         action_range = torch.ones(action_size)
         in_range = config.noise_units == "range"
         common: dict[str, Any] = {
@@ -50,6 +59,10 @@ class Agents(nn.Module):
             obs = obs.index_fill(-1, self.hidden, 0.0)
         return torch.cat([obs, goal], -1)
 
+    def manager_input(self, obs: Tensor) -> Tensor:
+        """What the manager sees: (..., D) -> (..., D)."""
+        return obs.index_fill(-1, self.unseen, 0.0) if len(self.unseen) else obs
+
     @torch.no_grad()
     def act(self, obs: Tensor, goal: Tensor, noise: Tensor | None) -> Tensor:
         """Actions (N, A) in [-1, 1]; standard normal `noise` (N, A), None for none."""
@@ -61,7 +74,7 @@ class Agents(nn.Module):
     @torch.no_grad()
     def new_goal(self, obs: Tensor, noise: Tensor | None) -> Tensor:
         """Goals (N, k) within their box; standard normal `noise` (N, k), None for none."""
-        goal = self.manager.actor(obs)
+        goal = self.manager.actor(self.manager_input(obs))
         if noise is not None:
             goal = goal + EXPLORATION * self.manager.unit * noise
         return self.goals.clip(goal)
@@ -79,7 +92,7 @@ class Agents(nn.Module):
         if self.config.off_policy_correction:
             goal = self.relabel(rows, generator)
             relabelled = (goal != rows["goal"]).any(-1).to(goal.dtype).mean()
-        first, last = rows["obs"][:, 0], rows["obs"][:, -1]
+        first, last = (self.manager_input(rows["obs"][:, i]) for i in (0, -1))
         learnt = self.manager.update(first, goal, rows["reward"], last, rows["continues"], generator)
         return torch.cat([learnt, relabelled.unsqueeze(0)])
 
@@ -97,11 +110,10 @@ class Agents(nn.Module):
         during = torch.arange(c) < rows["length"].unsqueeze(1)
         seen, start = obs[:, :-1], self.goals.of_state(obs[:, :1])
         moved = start - self.goals.of_state(seen)  # (B, c, k)
-        scores = []
-        for i in range(candidates.shape[1]):  # one candidate at a time: its rows fit a core's cache
-            goal = candidates[:, i : i + 1] + moved
-            mu = self.low.actor(self.low_input(seen, goal).flatten(0, 1)).view(B, c, -1)
-            scores.append(-((action - mu).square().sum(-1) * during).sum(1))
+        scores = [
+            -((action - mu).square().sum(-1) * during).sum(1)
+            for mu in self.low.actor.of_shifted(self.low_input(seen, moved), candidates)
+        ]
         best = torch.stack(scores, 1).argmax(1)
         return candidates[torch.arange(B), best]
 
@@ -186,4 +198,7 @@ def make_agents(config: HiroConfig, envs: Any, seed: int) -> Agents:
     else:
         goals = Goals.about(envs.layout.find("goal_space", config.goal_space), config.position_range)
     sizes = envs.single_observation_space.shape[0], envs.single_action_space.shape[0]
-    return Agents(config, goals, *sizes, seeding.torch_generator(seed, "initialisation"))
+    unseen: list[int] = []
+    if config.goal_space == "body" and POSITION[0] not in envs.observation_names:  # "without access to (x, y)"
+        unseen = [i for i, name in enumerate(envs.observation_names) if name in ABSOLUTE]
+    return Agents(config, goals, *sizes, seeding.torch_generator(seed, "initialisation"), unseen)

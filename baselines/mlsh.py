@@ -19,7 +19,7 @@ what differs from the published code. Algorithm 1 of Frans et al., line by line:
 
 import dataclasses
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,7 +30,8 @@ from hippo.core import seeding
 from hippo.core.advantages import Advantages, Baselines, advantages, masked_standardize
 from hippo.core.checkpoint import Checkpoint
 from hippo.core.gae import segment_gae
-from hippo.core.hierarchy import Acting, Batch, HierarchicalPolicy, HierarchyConfig, collect, restored
+from hippo.core.hierarchy import Acting, Batch, HierarchicalPolicy, collect, restored
+from hippo.core.hierarchy_config import HierarchyConfig
 from hippo.core.levels import levels, policy_statistics
 from hippo.core.log import RunLog, check_finite
 from hippo.core.minibatch import maximize_in_minibatches
@@ -137,9 +138,15 @@ class MLSHPolicy(HierarchicalPolicy):
     """HiPPO's hierarchy with a master that can start over."""
 
     def __init__(
-        self, config: MLSHConfig, obs_size: int, robot_size: int, action_size: int, generator: torch.Generator
+        self,
+        config: MLSHConfig,
+        obs_size: int,
+        robot_size: int,
+        action_size: int,
+        generator: torch.Generator,
+        names: Sequence[str] = (),
     ) -> None:
-        super().__init__(config, obs_size, robot_size, action_size, generator)
+        super().__init__(config, obs_size, robot_size, action_size, generator, names)
         self.obs_size = obs_size
         self.manager = Master(obs_size, config.num_skills, config.manager_hidden_sizes, generator)
         self.manager.exploration = config.exploration
@@ -237,7 +244,7 @@ def train(config: MLSHConfig, make_envs: MakeEnvs, log: RunLog, seed: int, check
     envs = make_envs(config.num_envs, "training")
     obs_size, action_size = envs.single_observation_space.shape[0], envs.single_action_space.shape[0]
     generator = seeding.torch_generator(seed, "initialisation")
-    policy = MLSHPolicy(config, obs_size, envs.robot_size, action_size, generator)
+    policy = MLSHPolicy(config, obs_size, envs.robot_size, action_size, generator, envs.observation_names)
     start_from(config.skills, policy.skills, envs)
     baselines = Baselines(config, obs_size, generator)
     optimizers: dict[str, torch.optim.Optimizer] = {

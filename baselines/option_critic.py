@@ -37,6 +37,7 @@ from hippo.core.policies import POLICY_HEAD
 from hippo.core.ppo import Level, Rows, clipped_surrogate, in_chunks, surrogate_statistics
 from hippo.core.skills import start_from
 from hippo.core.training import MakeEnvs, Training
+from hippo.core.view import Ego
 
 __all__ = ["Acting", "OptionCriticConfig", "restored", "train"]
 
@@ -46,9 +47,10 @@ REVISION = 1  # bumped by every change that alters the metrics of tests/golden
 def make_policy(config: OptionCriticConfig, envs: Any, generator: torch.Generator) -> OptionPolicy:
     """Freshly drawn networks for these environments."""
     obs_size = envs.single_observation_space.shape[0]
+    ego = Ego(envs.observation_names[: envs.robot_size]) if config.skill_observation == "ego" else None
     policy = OptionPolicy(
         obs_size,
-        envs.robot_size if config.skill_observation == "robot" else obs_size,
+        {"robot": envs.robot_size, "full": obs_size}[config.skill_observation] if ego is None else ego.size,
         envs.single_action_space.shape[0],
         config.num_skills,
         config.skill_hidden_sizes,
@@ -60,6 +62,7 @@ def make_policy(config: OptionCriticConfig, envs: Any, generator: torch.Generato
         config.log_std_per_skill,
         config.termination_bias,
     )
+    policy.skills.ego = ego
     if config.initialisation == "normc":
         normalize_columns([policy.skills.first, *policy.skills.rest.layers], POLICY_HEAD, generator)
         normalize_columns(policy.manager.logits.layers, POLICY_HEAD, generator)
@@ -109,7 +112,7 @@ def improve(
     epochs, clip_range = config.updates, config.clip_range
 
     def log_prob(c: Rows) -> Tensor:
-        return policy.skills.log_prob(data.seen[c, : policy.robot_size], data.option[c], data.action[c])
+        return policy.skills.log_prob(policy.skills.see(data.seen[c]), data.option[c], data.action[c])
 
     level = Level("skill", log_prob, data.advantage)
     parts = rows // size if size else 1
@@ -147,7 +150,7 @@ def log_probs(policy: OptionPolicy, data: Portion) -> tuple[Tensor, Tensor]:
     """Log-probabilities of the actions taken (B,), and of the options chosen at decisions."""
 
     def of_action(c: slice) -> Tensor:
-        return policy.skills.log_prob(data.seen[c, : policy.robot_size], data.option[c], data.action[c])
+        return policy.skills.log_prob(policy.skills.see(data.seen[c]), data.option[c], data.action[c])
 
     seen, choice = data.seen[data.is_decision], data.option[data.is_decision]
     return in_chunks(of_action, len(data.option)), of_option(policy.manager.log_probs(seen), choice)

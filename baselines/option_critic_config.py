@@ -2,9 +2,11 @@
 
 import dataclasses
 from dataclasses import dataclass
+from typing import Any
 
 from hippo.core.budget import BudgetConfig
-from hippo.core.settings import MOST_SKILLS, WIDEST, setting
+from hippo.core.settings import MOST_SKILLS, WIDEST, ConfigError, setting
+from hippo.core.view import check_view
 
 
 @dataclass
@@ -82,10 +84,11 @@ class OptionCriticConfig(BudgetConfig):
     )
     skill_observation: str = setting(
         "robot",
-        "what the intra-option policies see: the robot's own observation or everything",
+        "what the intra-option policies see: the robot's own observation, the same free of place and heading (ego), "
+        "or everything",
         code="everything",
         ours="robot: as HiPPO's skills",
-        choices=("robot", "full"),
+        choices=("robot", "ego", "full"),
     )
     initialisation: str = setting(
         "glorot",
@@ -117,6 +120,16 @@ class OptionCriticConfig(BudgetConfig):
         high=WIDEST,
     )
     critic_hidden_sizes: list[int] = setting([64, 64], "hidden layers of the critic", code="2 x 64", low=1, high=WIDEST)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.skill_observation == "ego" and self.observation_filter and not self.skills:
+            valid = "turns observations as they are: needs observation_filter=false"
+            raise ConfigError("skill_observation", "ego", valid)
+
+    def check_environment(self, robot: str, options: dict[str, Any], layout: Any = None) -> None:
+        """Refuse a view that an environment of gym:<id>, with a `layout`, has not."""
+        check_view(self.skill_observation, layout)
 
     @property
     def scale(self) -> float:

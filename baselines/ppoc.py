@@ -25,7 +25,6 @@ def improve_as_ppoc(
     pushed at every step by the advantages of actions, with the log-probability of the minibatch's first state only.
     """
     parameters = [p for group in optimizer.param_groups for p in group["params"]]
-    robot = policy.robot_size
 
     def step(loss: Tensor, learning_rate: float) -> None:
         gradients = torch.autograd.grad(loss, parameters, allow_unused=True, materialize_grads=True)
@@ -35,7 +34,7 @@ def improve_as_ppoc(
         optimizer.step()
 
     with torch.no_grad():
-        old = policy.skills.log_prob(data.seen[:, :robot], data.option, data.action)
+        old = policy.skills.log_prob(policy.skills.see(data.seen), data.option, data.action)
     for option in range(policy.num_options):
         rows = (data.option == option).nonzero().squeeze(-1)
         size = config.minibatch_size
@@ -50,7 +49,7 @@ def improve_as_ppoc(
                 (policy.beta(seen)[:, option] * (q[:, option] - value + config.switching_cost)).sum(),
                 PPOC_TERMINATION_STEP,
             )
-            log_prob = policy.skills.log_prob(seen[:, :robot], data.option[i], data.action[i])
+            log_prob = policy.skills.log_prob(policy.skills.see(seen), data.option[i], data.action[i])
             policy_loss = -clipped_surrogate(log_prob, old[i], advantage, config.clip_range).mean()
             critic_loss = (policy.critic(seen)[:, option] - data.returns[i]).square().mean()
             log_pi = policy.manager.log_probs(seen)

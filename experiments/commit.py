@@ -4,8 +4,8 @@ Rows already committed stay as they are, new ones are added; the same command ag
 `<figure>.csv`, `<figure>.runs.csv` says where every run comes from: commit, lock file, processor.
 
 Learning curves are thinned to at most 250 rows per run: of k iterations in a row the mean return, at the last one's
-environment steps, with the smallest k that is enough. Means over the last 10 % and over all iterations stay what they
-were, but for the one group that k cuts.
+environment steps, with the smallest k that is enough (and that divides MLSH's cycle). Means over the last 10 % and over
+all iterations stay what they were, but for the one group that k cuts.
 """
 
 import io
@@ -30,9 +30,11 @@ ORIGIN = ("git_commit", "git_difference", "lock", "cpu", "cpu_capability")  # of
 RUN_COLUMNS = ["run_id", *ORIGIN]
 
 
-def thinned(rows: pd.DataFrame) -> pd.DataFrame:
-    """Rows of one run and metric, in order -> at most MOST_ROWS of them."""
+def thinned(rows: pd.DataFrame, cycle: int = 1) -> pd.DataFrame:
+    """Rows of one run and metric, in order -> at most MOST_ROWS of them, and whole ones per `cycle` iterations."""
     size = -(-len(rows) // MOST_ROWS)
+    if size <= cycle:
+        size = next(k for k in range(size, cycle + 1) if cycle % k == 0)
     group = pd.Series(range(len(rows)), index=rows.index) // size
     others = {column: "last" for column in rows.columns if column != "value"}
     return rows.groupby(group).agg(others | {"value": "mean"})
@@ -60,13 +62,15 @@ def commit(results: Results, runs_dir: Path, data: Path) -> tuple[int, int]:
     origins = path.with_suffix(".runs.csv")
     old = read_committed(path, scale)
     known = pd.read_csv(origins, dtype=str) if origins.exists() else pd.DataFrame(columns=RUN_COLUMNS)
+    cycles = {run["run_id"]: run.get("cycle", 1) for run in results.plan["runs"]}
     kinds = {run["run_id"]: run["kind"] for run in results.plan["runs"] if run["state"] == "finished"}
     incomplete = {run["run_id"] for run in results.missing}
     new = results.frame[results.frame["run_id"].isin(set(kinds) - incomplete - set(old["run_id"]))]
     parts = [old] if len(old) else []
     for run_id, of_run in new.groupby("run_id", sort=False):
-        trained = kinds[str(run_id)] == "train"
-        parts.append(thinned(of_run[of_run["metric"] == "return_mean"]) if trained else of_run)
+        if kinds[str(run_id)] == "train":
+            of_run = thinned(of_run[of_run["metric"] == "return_mean"], cycles[str(run_id)])
+        parts.append(of_run)
     fresh = list(dict.fromkeys(new["run_id"]))
     if fresh:
         path.parent.mkdir(parents=True, exist_ok=True)

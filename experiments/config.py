@@ -111,6 +111,7 @@ class Run:
         robot = environment(self.env).robot
         shared = {name: getattr(self.config, name) for name in SHARED_WITH_SKILLS if hasattr(self.config, name)}
         overrides = [f"algo.{name}={json.dumps(value)}" for name, value in shared.items()]
+        overrides += ["algo.skill_observation=ego"] * (getattr(self.config, "skill_observation", "") == "ego")
         overrides += [f"env.{name}={value}" for name, value in self.options.items() if name == "observation"]
         chosen = [f"env={robot}", f"algo={PRETRAINING[robot]}", f"scale={self.scale}"]
         return compose_run([*chosen, *overrides], self.runs_dir)
@@ -204,8 +205,16 @@ def committed_skills(run: Run) -> Path | None:
     return path if run.kind == "pretrain" and path.exists() and read_skills(path)[0]["run_id"] == run.run_id else None
 
 
+def whole(batch: int, horizon: int) -> int:
+    """Environment steps that an iteration takes: a batch, up to whole horizons, as every learner collects it."""
+    return -(-batch // horizon) * horizon
+
+
 @functools.cache
 def _register() -> None:
+    # What conf/algo/hiro.yaml makes of an off-policy budget, so that it is the same for every horizon.
+    OmegaConf.register_new_resolver("whole_horizons", lambda batch, horizon: max(horizon, batch // horizon * horizon))
+    OmegaConf.register_new_resolver("iterations_of", lambda steps, batch, horizon: -(-steps // whole(batch, horizon)))
     store = ConfigStore.instance()
     store.store(name="run_schema", node=RunSchema)
     store.store(group="env", name="env_schema", node=EnvConfig)

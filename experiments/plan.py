@@ -44,6 +44,8 @@ class Entry:
             "seed": run.seed,
             "iterations": run.config.iterations,
             "batch_size": run.config.batch_size,
+            "env_steps": run.env_steps,
+            "cycle": getattr(run.config, "cycle_length", 1),  # iterations after which a method starts over
             "physics": run.options.get("physics", "paper"),
             "kind": run.kind,
             "ancestors": [ancestor.run_id for ancestor in run.ancestors],

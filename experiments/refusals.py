@@ -15,7 +15,7 @@ from experiments import synonyms
 from experiments.choices import GROUPS, check_choice, group_choices, nearest
 from experiments.schema import BUDGET_FIELDS, PRETRAINED, PRETRAINING, SHARED_WITH_SKILLS
 from hippo.core.settings import ConfigError
-from hippo.core.skills import SkillsError, read_skills
+from hippo.core.skills import SkillsError, read_skills, view_of
 from hippo.envs import ENVIRONMENTS, environment, foreign
 from hippo.envs.arguments import Refused
 
@@ -126,6 +126,8 @@ def check_skills(path: str, env: dict[str, Any], settings: dict[str, Any]) -> No
         raise ConfigError("algo.skills", path, f"must be {PRETRAINED} or a skills file ({error})") from error
     wanted = {"robot": environment(env["name"]).robot, "observation": env["observation"]}
     wanted |= {name.removeprefix("skill_"): settings[name] for name in SHARED_WITH_SKILLS if name in settings}
+    if "skill_observation" in settings:  # HIRO, which has no skills of its own, takes either
+        wanted["view"] = "ego" if settings["skill_observation"] == "ego" else "robot"
     for key, value in wanted.items():
-        if metadata[key] != value:
-            raise ConfigError("algo.skills", path, f"has {key} {metadata[key]}, this run needs {value}")
+        if (has := view_of(metadata) if key == "view" else metadata[key]) != value:
+            raise ConfigError("algo.skills", path, f"has {key} {has}, this run needs {value}")

@@ -42,8 +42,8 @@ class Budget:
 class OffPolicyBudget:
     """What an off-policy learner (HIRO) gets at one scale, whatever the environment."""
 
-    iterations: int = MISSING
-    batch_size: int = MISSING
+    steps: int = MISSING  # in all
+    batch_size: int = MISSING  # environment steps per iteration, down to whole horizons
 
 
 @dataclass

@@ -24,7 +24,8 @@ from hippo.core import seeding
 from hippo.core.advantages import Baselines, advantages
 from hippo.core.checkpoint import Checkpoint
 from hippo.core.gae import gae
-from hippo.core.hierarchy import Batch, HierarchicalPolicy, HierarchyConfig, collect, restored
+from hippo.core.hierarchy import Batch, HierarchicalPolicy, collect, restored
+from hippo.core.hierarchy_config import HierarchyConfig
 from hippo.core.levels import levels
 from hippo.core.policies import gaussian_log_prob
 from hippo.core.ppo import CHUNK, chunks

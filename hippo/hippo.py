@@ -9,7 +9,7 @@ where k runs over the manager's decisions and t over environment steps. Where to
     Algorithm 1, HiPPO Rollout                     hippo/core/hierarchy.py   collect
       lines 4, 5: draw p, then z ~ pi_h                                      Commitment.renew, Acting.decide
       lines 6 to 9: a ~ pi_l for p steps                                     Acting.action, Commitment.advance
-    settings of the hierarchy (n, p, networks)     hippo/core/hierarchy.py   HierarchyConfig
+    settings of the hierarchy (n, p, networks)     hippo/core/hierarchy_config.py   HierarchyConfig
     Algorithm 2, HiPPO                             here                      train
       line 4: N trajectories                       hippo/core/hierarchy.py   collect
       line 5: advantages of both levels (4.2)      hippo/core/advantages.py  advantages
@@ -27,7 +27,8 @@ from torch import nn
 from hippo.core import seeding
 from hippo.core.advantages import Baselines, advantages
 from hippo.core.checkpoint import Checkpoint
-from hippo.core.hierarchy import Acting, HierarchyConfig, collect, new_policy, restored
+from hippo.core.hierarchy import Acting, collect, new_policy, restored
+from hippo.core.hierarchy_config import HierarchyConfig
 from hippo.core.levels import levels, policy_statistics
 from hippo.core.log import RunLog, check_finite
 from hippo.core.on_policy import SurrogateConfig, improve, make_optimizer

@@ -55,6 +55,11 @@ def planned(folder: Path) -> dict[str, Any]:
     labels = {"env_label": env_label, "variant": label, "variant_label": label}
     rest = {"physics": identity["options"].get("physics", "paper"), "kind": "train", "state": "finished"}
     edition = {"scale": config["scale"], "protocol": config.get("protocol", PAPER)}
+    settings = config.get("config", {})
+    horizon = settings.get("horizon", identity["batch_size"])
+    steps = horizon * -(-identity["batch_size"] // horizon)  # of whole horizons
+    cycle = settings.get("warmup_iterations", 0) + settings.get("joint_iterations", 0) or 1  # of MLSH
+    budget |= {"env_steps": identity["iterations"] * steps, "cycle": cycle}
     return {"run_id": manifest["run_id"]} | edition | budget | labels | rest
 
 
@@ -94,8 +99,8 @@ def rows(results: Results, folders: dict[str, Path]) -> list[dict[str, Any]]:
     """The table: a row of TABLE per environment and method that has data.
 
     `final` is the mean over seeds of the last 10 % of iterations, `low` and `high` its 95 % bootstrap interval (NaN for
-    one seed), `area` the mean return over the environment steps trained, `hours` the training time of all seeds
-    together (NaN where it is not known, as of committed rows).
+    one seed), `area` the mean return over the environment steps trained, both of whole cycles where a method starts
+    over, `hours` the training time of all seeds together (NaN where it is not known, as of committed rows).
 
     Args:
         folders: run id -> run folder.
@@ -107,9 +112,10 @@ def rows(results: Results, folders: dict[str, Path]) -> list[dict[str, Any]]:
             whole = [curve for seed in seeds if len(curve := table[seed].dropna())]
             if not whole:
                 continue
-            final = np.array([stats.final_performance(curve.to_numpy()) for curve in whole])
+            cycle = results.rows_per_cycle(env, variant, whole[0].index[0])
+            final = np.array([stats.final_performance(curve.to_numpy(), cycle) for curve in whole])
             interval = stats.bootstrap_mean(final)
-            area = np.mean([area_under(curve) for curve in whole])
+            area = np.mean([area_under(curve[: len(stats.whole_cycles(curve.to_numpy(), cycle))]) for curve in whole])
             ids = [r["run_id"] for r in results.plan["runs"] if (r["env"], r["variant"]) == (env, variant)]
             spent = sum(hours(folders[run_id]) for run_id in ids if run_id in set(results.frame["run_id"]))
             numbers = (interval.point, interval.low, interval.high, area)

@@ -4,7 +4,6 @@ Only what is there is drawn: no panel, no entry of the legend and no count of se
 """
 
 import argparse
-import math
 import textwrap
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -13,7 +12,6 @@ from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
-import pandas as pd
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -23,8 +21,9 @@ from matplotlib.patheffects import withStroke
 
 from analysis import stats
 from analysis.edition import PAPER, Edition
-from analysis.runs import COLUMNS, Results, scores
+from analysis.runs import Results, scores, write_rows
 from paper_figures import command_line, style
+from paper_figures.clock import CAPTION, by_clock
 
 MOST_POINTS = 2000  # of a curve that are drawn, several for every pixel
 SHORTER = 0.95  # methods whose budget is below this share of the longest have their last value held
@@ -105,7 +104,10 @@ def planned(results: Results, env: str) -> dict[str, dict[str, Any]]:
 
 def budgets(results: Results, env: str) -> dict[str, float]:
     """Planned environment steps of every variant in one environment."""
-    return {variant: float(run["iterations"] * run["batch_size"]) for variant, run in planned(results, env).items()}
+    return {
+        variant: float(run.get("env_steps", run["iterations"] * run["batch_size"]))
+        for variant, run in planned(results, env).items()
+    }
 
 
 def write_seeds(axes: Axes, seeds: dict[str, int], variants: list[str]) -> None:
@@ -136,9 +138,10 @@ def final_line(results: Results, env: str) -> str:
     """The paper's own statistic in words: final performance of every method, mean ± standard deviation over seeds."""
     words = []
     for variant, label in unique(results, "variant").items():
-        seeds, _, table = scores(results.frame, env, variant)
+        seeds, steps, table = scores(results.frame, env, variant)
         if seeds:
-            final = np.array([stats.final_performance(table[seed].dropna().to_numpy()) for seed in seeds])
+            cycle = results.rows_per_cycle(env, variant, steps[0])
+            final = np.array([stats.final_performance(table[seed].dropna().to_numpy(), cycle) for seed in seeds])
             spread = f" ± {stats.standard_deviation(final):.3g}" if len(seeds) > 1 else ""
             words.append(f"{label} {final.mean():.3g}{spread}")
     return "; ".join(words)
@@ -212,6 +215,9 @@ def caption(results: Results, share: float, extra: "Extra | None") -> str:
     if without := left_out(results, extra):
         lines.append(f"Not shown: {without}.")
     labels = unique(results, "env")
+    if saws := {run["variant_label"]: run["cycle"] for run in plan["runs"] if run.get("cycle", 1) > 1}:
+        what = ", ".join(f"{label} ({cycle})" for label, cycle in saws.items())
+        lines.append(f"Numbers of methods that start over are of whole cycles, in iterations: {what}.")
     for env in (env for env, of in seeds.items() if of):
         final = final_line(results, env)
         lines.append(f"Last 10 % of iterations, mean ± standard deviation over seeds, {labels[env]}: {final}.")
@@ -279,9 +285,11 @@ def picture(results: Results, share: float, extra: Extra | None, columns: int, w
 def draw_curves(axes: Axes, results: Results, env: str, share: float) -> None:
     """The learning curves of one environment with their axes."""
     steps = results.frame.loc[results.frame["env"] == env, "env_steps"]
-    unit, name = (1e6, "million") if steps.max() >= 5e5 else (1e3, "thousand")
+    unit, name = (1e6, "million env. steps") if steps.max() >= 5e5 else (1e3, "thousand env. steps")
+    if "axis" in results.plan:
+        unit, name = 1, results.plan["axis"]
     draw_panel(axes, results, env, unit, share)
-    axes.set_xlabel(f"{name} env. steps")
+    axes.set_xlabel(name)
     axes.set_xlim(left=0)
     low, high = axes.dataLim.intervaly
     if low == high:  # lines that all coincide look like one line
@@ -290,21 +298,17 @@ def draw_curves(axes: Axes, results: Results, env: str, share: float) -> None:
         axes.text(0.5, 0.55, text, transform=axes.transAxes, ha="center", fontsize=6.5, color="#555555")
 
 
-def write_rows(frame: pd.DataFrame, path: Path) -> None:
-    """Write the rows of a figure as `frame.to_csv` does, but in half of its time: their words need no quotes."""
-    columns = [frame[name].to_numpy().tolist() for name in COLUMNS]
-    columns[-1] = ["" if math.isnan(value) else value for value in columns[-1]]
-    with path.open("w", newline="\n") as file:
-        file.write(",".join(COLUMNS) + "\n")
-        file.writelines(
-            f"{a},{b},{c},{d},{e},{f},{g},{h},{i}\n" for a, b, c, d, e, f, g, h, i in zip(*columns, strict=True)
-        )
-
-
-def draw(results: Results, out: Path, extra: Extra | None = None, share: float = command_line.SMOOTH) -> list[Path]:
+def draw(
+    results: Results,
+    out: Path,
+    extra: Extra | None = None,
+    share: float = command_line.SMOOTH,
+    clocked: Results | None = None,
+) -> list[Path]:
     """Draw and write <figure>.csv, .pdf, .svg, .png and .caption.txt under `out`/<scale>/; returns the paths.
 
-    With more than one panel also <figure>.narrow.png, the panels below each other, as a phone shows them.
+    With more than one panel also <figure>.narrow.png, the panels below each other, as a phone shows them; where the
+    runs' clocks are there (`clocked`), <figure>.clock.png, by wall-clock.
     """
     style.use()
     plan = results.plan
@@ -315,6 +319,12 @@ def draw(results: Results, out: Path, extra: Extra | None = None, share: float =
     title = f"{plan['figure']}: {plan['title']}"
     paths = style.save(wide, style.formats(stem), title, results.provenance())
     plt.close(wide)
+    clock = stem.with_name(f"{stem.name}.clock.png")
+    clock.unlink(missing_ok=True)
+    if clocked is not None:
+        figure = picture(clocked, share, None, columns, style.WIDTH * min(1, (columns + 1) / 3))
+        paths += style.save(figure, [clock], f"{title}, by wall-clock", results.provenance())
+        plt.close(figure)
     narrow = style.narrow(stem)
     narrow.unlink(missing_ok=True)
     if panels > 1:
@@ -323,7 +333,7 @@ def draw(results: Results, out: Path, extra: Extra | None = None, share: float =
         plt.close(figure)
     csv, text_path = stem.with_suffix(".csv"), stem.with_suffix(".caption.txt")
     write_rows(results.frame, csv)
-    text_path.write_text(caption(results, share, extra))
+    text_path.write_text(caption(results, share, extra) + (f"{CAPTION}\n" if clocked is not None else ""))
     return [csv, *paths, text_path]
 
 
@@ -331,7 +341,8 @@ def main(figure: str, arguments: Sequence[str] | None = None, extra: Extra | Non
     """Draw one figure from the command line."""
 
     def write(results: Results, options: argparse.Namespace) -> str:
-        return "wrote " + " ".join(map(str, draw(results, options.out, extra, options.smooth)))
+        paths = draw(results, options.out, extra, options.smooth, by_clock(results, options.runs_dir))
+        return "wrote " + " ".join(map(str, paths))
 
     metrics = ("return_mean", *(extra.metrics if extra is not None else ()))
     return command_line.make(figure, arguments, metrics, write)

@@ -125,7 +125,7 @@ def action_distance(policy: SkillPolicy, obs: Tensor) -> float:
 
     sqrt(|mu_i - mu_j|^2 + |sigma_i - sigma_j|^2) for diagonal Gaussians, in units of the action range's half.
     """
-    mean, std = policy.means(obs[:, : policy.first.inputs]), policy.log_std().exp()
+    mean, std = policy.means(policy.see(obs)), policy.log_std().exp()
     pairs = itertools.combinations(range(policy.num_skills), 2)
     distances = [
         ((mean[:, i] - mean[:, j]).square().sum(-1) + (std[i] - std[j]).square().sum()).sqrt().mean() for i, j in pairs
@@ -213,7 +213,7 @@ def study(path: Path, paths: int, seed: int) -> dict[str, pd.DataFrame]:
         for network in range(RANDOM_NETWORKS)
     }
     envs = make(env, 1, 0)
-    names = envs.observation_names[: metadata["obs_size"]]
+    names = envs.observation_names[: envs.robot_size]
     envs.close()
     metrics, rolled = [], {}
     for (group, network), each in policies.items():
@@ -282,7 +282,7 @@ def film(path: Path, folder: Path, seed: int) -> None:
         NoOpenGL: nothing here can draw.
     """
     policy, metadata = policy_of(path)
-    act, size = policy.actor(), policy.first.inputs
+    act = policy.actor()
     for z in range(policy.num_skills):
         target, rng = folder / f"{metadata['env']}_skill_{z}.mp4", np.random.default_rng(seed)
         with streamed(target) as append:
@@ -290,7 +290,7 @@ def film(path: Path, folder: Path, seed: int) -> None:
             obs, _ = envs.reset(seed=seed)
             for _ in range(VIDEO_STEPS[metadata["env"]]):
                 noise = rng.standard_normal((1, *envs.single_action_space.shape), np.float32)
-                obs, *_ = envs.step(act(obs[:, :size], np.array([z]), noise))
+                obs, *_ = envs.step(act(policy.see_array(obs), np.array([z]), noise))
             envs.close()
         print(f"wrote {target}", flush=True)
 

@@ -62,6 +62,7 @@ class MovementBandits(gym.vector.VectorEnv):
 
     metadata = {"autoreset_mode": gym.vector.AutoresetMode.SAME_STEP}  # noqa: RUF012
     robot_name, observation_variant, robot_size, horizon = "point", "paper", 6, 50
+    observation_names = ("x", "y", "goal_0_x", "goal_0_y", "goal_1_x", "goal_1_y")
     reach, step_size, radius = 200.0, 20.0, 50.0
 
     def __init__(self, num_envs: int, seed: int) -> None:

@@ -7,7 +7,8 @@ from torch import Tensor, nn
 
 from hippo.core.direct import SquaredError, network_of
 from hippo.core.gae import gae, segment_gae
-from hippo.core.hierarchy import Batch, HierarchyConfig, with_time
+from hippo.core.hierarchy import Batch, with_time
+from hippo.core.hierarchy_config import HierarchyConfig
 from hippo.core.levels import rows_by_skill
 from hippo.core.normalize import RewardScale, standardize
 from hippo.core.value import ValueFunction, explained_variance

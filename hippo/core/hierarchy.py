@@ -3,6 +3,7 @@
 HiPPO, HierVPG and MLSH train this same hierarchy and differ in what they do with a batch of it.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,91 +16,12 @@ from torch import Tensor, nn
 from hippo.core import seeding
 from hippo.core.acting import OfHorizons
 from hippo.core.checkpoint import Checkpoint
+from hippo.core.hierarchy_config import HierarchyConfig
 from hippo.core.networks import normalize_columns
 from hippo.core.normalize import ObservationFilter, actor_of
-from hippo.core.on_policy import OnPolicyConfig
 from hippo.core.policies import POLICY_HEAD, Manager, SkillPolicy, sample_categorical
 from hippo.core.rollout import Steps
-from hippo.core.settings import MOST_SKILLS, WIDEST, ConfigError, setting
-
-
-@dataclass
-class HierarchyConfig(OnPolicyConfig):
-    """What every algorithm that trains a hierarchy sets beside the rest: commitment, networks and what levels see.
-
-    The defaults are the paper's and, where it is silent, the authors' code's.
-    """
-
-    num_skills: int = setting(
-        6, "number of skills n", paper="6 (App. A)", code="6 (pg_test.py:332)", low=1, high=MOST_SKILLS
-    )
-    period_min: int = setting(
-        5, "shortest commitment in steps; equal to period_max: a fixed period", paper="5 (App. A)", low=1
-    )
-    period_max: int = setting(15, "longest commitment in steps, inclusive", paper="15 (App. A)", low=1)
-    skill_baseline: str = setting(
-        "skill",
-        "baseline of the skills: V(s, z, time left), the manager's V(s), or none",
-        paper="skill-dependent (section 4.2, Fig. 4)",
-        code="-sbl",
-        choices=("skill", "single", "none"),
-    )
-    manager_baseline: str = setting(
-        "single",
-        "baseline of the manager: V(s) or none",
-        paper="single (section 4.2)",
-        choices=("single", "none"),
-    )
-    manager_advantage: str = setting(
-        "step",
-        "advantage of a decision: the per-step advantage where it is made, or semi-Markov GAE; equal for lambda 1",
-        code="step (hippo2.py:186)",
-        choices=("step", "smdp"),
-    )
-    manager_hidden_sizes: list[int] = setting(
-        [32, 32], "manager's hidden layers", paper="2 x 32 (App. A)", low=1, high=WIDEST
-    )
-    skill_hidden_sizes: list[int] = setting(
-        [64, 64], "skill network's hidden layers", paper="2 x 64 (App. A)", low=1, high=WIDEST
-    )
-    skill_integration: str = setting(
-        "bilinear",
-        "how the skill enters the skill network",
-        code="bilinear (pg_test.py:157)",
-        choices=("bilinear", "concatenate"),
-    )
-    skill_observation: str = setting(
-        "robot",
-        "what skills see: the robot's own observation or everything",
-        paper="pi(a|s, z), silent",
-        code="robot (test2_hier_snn_mlp_policy.py:180)",
-        choices=("robot", "full"),
-    )
-    log_std_per_skill: bool = setting(
-        False, "one log-std vector per skill instead of a shared one", code="shared (test2_hier_snn_mlp_policy.py:226)"
-    )
-    skills: str = setting(
-        "",
-        "skills file that the lower level starts from; empty: from scratch",
-        paper="from scratch; given skills in Fig. 6",
-        code="-snnp, a pickle (test2_hier_snn_mlp_policy.py:122)",
-    )
-    truncate_to_period: bool = setting(
-        False,
-        "do not learn from the steps of an episode after its last whole period, as the authors with fixed p",
-        code="yes for fixed p (hier_batch_sampler.py:36)",
-        ours="no: it hides about 90 % of the Ant's falls at p = 10",
-    )
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.period_min > self.period_max:
-            raise ConfigError("period_min", self.period_min, f"must be at most period_max={self.period_max}")
-        if self.truncate_to_period and self.period_min < self.period_max:
-            raise ConfigError("truncate_to_period", True, "needs a fixed period (period_min = period_max)")
-        if self.skills and self.normalize_observations:
-            valid = "is a file of skills that see observations as they are: needs normalize_observations=false"
-            raise ConfigError("skills", self.skills, valid)
+from hippo.core.view import Ego
 
 
 def with_time(obs: Tensor, time_left: Tensor) -> Tensor:
@@ -112,15 +34,25 @@ class HierarchicalPolicy(nn.Module):
 
     Only with a random period do the two see the time left (authors' code: fixed-p networks do not). Observations are
     those that `collect` records: where the policy has a filter, they have passed it.
+
+    Args:
+        names: of an observation's entries, which `skill_observation=ego` goes by.
     """
 
     def __init__(
-        self, config: HierarchyConfig, obs_size: int, robot_size: int, action_size: int, generator: torch.Generator
+        self,
+        config: HierarchyConfig,
+        obs_size: int,
+        robot_size: int,
+        action_size: int,
+        generator: torch.Generator,
+        names: Sequence[str] = (),
     ) -> None:
         super().__init__()
         self.num_skills = config.num_skills
         self.filter = ObservationFilter(obs_size) if config.normalize_observations else None
-        self.skill_view = robot_size if config.skill_observation == "robot" else obs_size
+        ego = Ego(names[:robot_size]) if config.skill_observation == "ego" else None
+        self.skill_view = {"robot": robot_size, "full": obs_size}[config.skill_observation] if ego is None else ego.size
         self.sees_time = config.period_min < config.period_max
         extra = int(self.sees_time)
         self.manager = Manager(obs_size + extra, config.num_skills, config.manager_hidden_sizes, generator)
@@ -133,6 +65,7 @@ class HierarchicalPolicy(nn.Module):
             config.skill_integration,
             config.log_std_per_skill,
         )
+        self.skills.ego = ego
         if config.initialisation == "normc":
             normalize_columns(self.manager.logits.layers, POLICY_HEAD, generator)
             normalize_columns([self.skills.first, *self.skills.rest.layers], POLICY_HEAD, generator)
@@ -143,7 +76,7 @@ class HierarchicalPolicy(nn.Module):
 
     def skill_input(self, obs: Tensor, time_left: Tensor) -> Tensor:
         """(..., D), (...) -> (..., robot [+ 1])."""
-        view = obs[..., : self.skill_view]
+        view = obs[..., : self.skill_view] if self.skills.ego is None else self.skills.ego(obs)
         return with_time(view, time_left) if self.sees_time else view
 
 
@@ -275,8 +208,9 @@ class Acting(OfHorizons):
 
     def action(self) -> np.ndarray:
         """What the skills in force do (N, A) about what was last seen."""
-        policy, time_left = self.policy, self.commitment.time_left
-        seen = look(self._seen, time_left, self._everywhere, policy.skill_view, policy.sees_time)
+        policy, time_left, ego = self.policy, self.commitment.time_left, self.policy.skills.ego
+        whole = self._seen if ego is None else ego.of_array(self._seen)
+        seen = look(whole, time_left, self._everywhere, policy.skill_view, policy.sees_time)
         return self._skills(seen, self.skill, self._noise[self._t])
 
     def act(self, obs: np.ndarray) -> np.ndarray:
@@ -329,7 +263,7 @@ def collect(
 def new_policy(config: HierarchyConfig, envs: Any, generator: torch.Generator) -> HierarchicalPolicy:
     """Freshly drawn networks for these environments."""
     obs_size, action_size = envs.single_observation_space.shape[0], envs.single_action_space.shape[0]
-    return HierarchicalPolicy(config, obs_size, envs.robot_size, action_size, generator)
+    return HierarchicalPolicy(config, obs_size, envs.robot_size, action_size, generator, envs.observation_names)
 
 
 def restored(config: HierarchyConfig, envs: Any, checkpoint: Checkpoint) -> HierarchicalPolicy:

@@ -23,8 +23,8 @@ from hippo.core.rollout import Steps
 class OptionPolicy(nn.Module):
     """The networks of all options, each with a trunk of its own.
 
-    Intra-option policies are the skill network of HiPPO and see the first `robot_size` entries of an observation;
-    policy over options, terminations and critic see all of it.
+    Intra-option policies are the skill network of HiPPO and see the first `robot_size` entries of an observation
+    (or what `skills.ego` makes of them); policy over options, terminations and critic see all of it.
     """
 
     def __init__(
@@ -43,7 +43,7 @@ class OptionPolicy(nn.Module):
         termination_bias: float = 0.0,
     ) -> None:
         super().__init__()
-        self.num_options, self.robot_size = num_options, robot_size
+        self.num_options = num_options
         self.filter = ObservationFilter(obs_size)
         self.skills = SkillPolicy(
             robot_size,
@@ -127,7 +127,7 @@ class Acting(OfHorizons):
 
     def action(self) -> np.ndarray:
         """What the options in force do (N, A) about what was last seen."""
-        return self._act(self._seen[:, : self.policy.robot_size], self.skill, self._noise[self._t])
+        return self._act(self.policy.skills.see_array(self._seen), self.skill, self._noise[self._t])
 
     def act(self, obs: np.ndarray) -> np.ndarray:
         """Decide and act."""

@@ -21,6 +21,7 @@ from hippo.core.networks import (
     normalize_columns,
 )
 from hippo.core.normalize import ObservationFilter
+from hippo.core.view import Ego
 
 MIN_STD = 1e-4  # floor of the standard deviation (authors' code)
 POLICY_HEAD = 0.01  # norm of a policy's last weights under `initialisation=normc` (OpenAI Baselines)
@@ -206,10 +207,19 @@ class SkillPolicy(nn.Module):
     ) -> None:
         super().__init__()
         self.num_skills = num_skills
+        self.ego: Ego | None = None  # what skills see of the robot, where it is not all of it
         self.first = SkillLinear(obs_size, num_skills, hidden_sizes[0], integration, generator)
         self.rest = mlp([*hidden_sizes, action_size], generator)
         rows = num_skills if log_std_per_skill else 1
         self.log_std_parameter = nn.Parameter(torch.zeros(rows, action_size))
+
+    def see(self, obs: Tensor) -> Tensor:
+        """What skills without a time left see of observations: (..., D), the robot's entries first -> (..., inputs)."""
+        return obs[..., : self.first.inputs] if self.ego is None else self.ego(obs)
+
+    def see_array(self, obs: np.ndarray) -> np.ndarray:
+        """The same of arrays (N, D)."""
+        return obs[:, : self.first.inputs] if self.ego is None else self.ego.of_array(obs)
 
     def log_std(self) -> Tensor:
         """(Z, A) log standard deviation of every skill, floored."""

@@ -26,6 +26,7 @@ from hippo.core.rollout import LastInfo, Steps
 from hippo.core.settings import MOST_SKILLS, MOST_STEPS, WIDEST, setting
 from hippo.core.training import Training
 from hippo.core.value import ValueFunction, explained_variance
+from hippo.core.view import Ego
 
 
 @dataclass
@@ -60,6 +61,13 @@ class PretrainingConfig(BudgetConfig):
     log_std_per_skill: bool = setting(
         False, "one log-std vector per skill instead of a shared one", code="shared (snn_mlp_policy.py)"
     )
+    skill_observation: str = setting(
+        "robot",
+        "what skills see: the robot's own observation, or the same free of place and heading (ego)",
+        code="SNN: ego_obs of the authors' robots (train_snn_ant.py); DIAYN: without x",
+        ours="robot: the committed skills'",
+        choices=("robot", "ego"),
+    )
     learning_rate: float = setting(3e-3, "Adam step size", ours="HiPPO's; the originals use TRPO and SAC", above=0.0)
     clip_range: float = setting(0.1, "clipping parameter epsilon", ours="HiPPO's; the originals do not clip", above=0.0)
     updates: int = setting(10, "full-batch gradient steps per iteration", ours="HiPPO's", low=1)
@@ -72,6 +80,14 @@ class PretrainingConfig(BudgetConfig):
     )
     value_hidden_sizes: list[int] = setting(
         [32, 32], "hidden layers of the baseline V(s, z)", ours="HiPPO's", low=1, high=WIDEST
+    )
+    value_sees_time: bool = setting(
+        False, "whether V(s, z) also sees which share of a path has passed", ours="no; a path's return depends on it"
+    )
+    standardize_per_skill: bool = setting(
+        False,
+        "standardise advantages over the steps of each skill instead of over all",
+        ours="no; with it no skill's bonus drowns in another's",
     )
     value_iterations: int = setting(10, "the most loss evaluations of a fit of the baseline", ours="HiPPO's", low=1)
 
@@ -114,12 +130,12 @@ def collect(
     next_obs, position = np.empty((T, *steps.obs.shape[1:]), np.float32), np.empty((T + 1, N, 3))
     next_position = np.empty((T, N, 3))
 
-    act, size = policy.actor(), policy.first.inputs
+    act = policy.actor()
     obs = steps.reset(seeding.integer(seed, "episodes", iteration))
     active[0], begun, position[0] = drawn[0], np.zeros(N, np.int64), envs.com
     for t in range(T):
         start[t] = begun
-        obs, done = steps.step(t, act(obs[:, :size], active[t], noise[t]))
+        obs, done = steps.step(t, act(policy.see_array(obs), active[t], noise[t]))
         next_obs[t], next_position[t], position[t + 1] = obs, tapped.info["com"], envs.com
         if done.any():
             next_obs[t][done] = tapped.info["final_obs"][done]
@@ -151,7 +167,8 @@ def train_skills(
     """
     generator = seeding.torch_generator(seed, "initialisation")
     policy = new_policy(config, envs, generator)
-    baseline = ValueFunction(policy.first.inputs, config.value_hidden_sizes, generator, config.num_skills)
+    inputs = policy.first.inputs + config.value_sees_time
+    baseline = ValueFunction(inputs, config.value_hidden_sizes, generator, config.num_skills)
     optimizer = Adam(policy.parameters(), lr=config.learning_rate)
     parts = {"policy": policy, "baseline": baseline, "optimizer": optimizer} | objective.parts
     training = Training(log, checkpoint, parts)
@@ -193,10 +210,16 @@ def update(
 ) -> dict[str, float]:
     """HiPPO's clipped surrogate on the advantages of `reward` (T, N), then a new fit of V(s, z); returns metrics."""
     steps, skill = paths.steps, paths.skill
-    obs = steps.obs[..., : policy.first.inputs]
+    obs = policy.see(steps.obs)
     final_obs, step, env = steps.final()
-    value = baseline.predict(obs, skill)
-    final_value = baseline.predict(final_obs[..., : policy.first.inputs], skill[step, env])
+    valued, final_valued = obs, policy.see(final_obs)
+    if config.value_sees_time:
+        passed = share_passed(paths)
+        valued = torch.cat([obs, passed.unsqueeze(-1).to(obs.dtype)], -1)
+        after = passed[step, env] + 1 / len(paths.start)  # what follows a path's last step is still of that path
+        final_valued = torch.cat([final_valued, after.unsqueeze(-1).to(obs.dtype)], -1)
+    value = baseline.predict(valued, skill)
+    final_value = baseline.predict(final_valued, skill[step, env])
     next_value = value[1:].index_put((step, env), final_value)
     advantage = gae(reward, value[:-1], next_value, steps.terminated, steps.done, config.gamma, config.gae_lambda)
     target, order = advantage + value[:-1], skill[:-1].flatten().argsort(stable=True)  # rows sorted by skill
@@ -206,11 +229,23 @@ def update(
     def log_prob(c: Rows) -> Tensor:
         return policy.log_prob(rows[c], active[c], action[c])
 
-    level = Level("skill", log_prob, standardize(advantage).flatten()[order].to(rows.dtype))
+    standardized = standardize(advantage).flatten()[order]
+    if config.standardize_per_skill:
+        counts = torch.bincount(active, minlength=policy.num_skills).tolist()
+        standardized = torch.cat([standardize(a) for a in advantage.flatten()[order].split(counts) if len(a)])
+    level = Level("skill", log_prob, standardized.to(rows.dtype))
     losses = maximize([level], optimizer, config.updates, config.clip_range, steps.num_steps)
     explained = explained_variance(value[:-1].flatten(), target.flatten())
-    baseline.fit(rows, target.flatten()[order], config.value_iterations, active)
+    baseline.fit(valued[:-1].flatten(0, 1)[order], target.flatten()[order], config.value_iterations, active)
     return losses | {"skill_explained_variance": explained}
+
+
+def share_passed(paths: Paths) -> Tensor:
+    """Share of a whole path that has passed where each row begins, (T + 1, N) in [0, 1]; 0 where a path begins."""
+    T = len(paths.start)
+    passed = torch.arange(T).unsqueeze(1) - paths.start
+    last = torch.where(paths.steps.done[-1], 0, passed[-1] + 1)
+    return torch.cat([passed, last.unsqueeze(0)]).double() / T
 
 
 def skill_statistics(policy: SkillPolicy, paths: Paths) -> dict[str, float]:
@@ -228,8 +263,9 @@ def skill_statistics(policy: SkillPolicy, paths: Paths) -> dict[str, float]:
 
 def new_policy(config: PretrainingConfig, envs: Any, generator: torch.Generator) -> SkillPolicy:
     """The skill network that a hierarchy with a fixed period has for the robot of `envs`."""
-    return SkillPolicy(
-        envs.robot_size,
+    ego = Ego(envs.observation_names[: envs.robot_size]) if config.skill_observation == "ego" else None
+    policy = SkillPolicy(
+        envs.robot_size if ego is None else ego.size,
         config.num_skills,
         envs.single_action_space.shape[0],
         config.skill_hidden_sizes,
@@ -237,6 +273,8 @@ def new_policy(config: PretrainingConfig, envs: Any, generator: torch.Generator)
         config.skill_integration,
         config.log_std_per_skill,
     )
+    policy.ego = ego
+    return policy
 
 
 def trained_skills(
@@ -253,6 +291,8 @@ def trained_skills(
         "algo": algo,
         "env_steps": iterations * config.num_envs * config.horizon,
         "physics": envs.options.physics,
+        "view": config.skill_observation,
+        "names": list(envs.observation_names[: envs.robot_size]),
     }
     envs.close()
     return policy, metadata

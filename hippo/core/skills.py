@@ -9,6 +9,7 @@ from torch import Tensor
 from hippo.core import checkpoint
 from hippo.core.checkpoint import CheckpointError
 from hippo.core.policies import SkillPolicy
+from hippo.core.view import Ego
 
 METADATA = (
     "robot",
@@ -25,6 +26,10 @@ METADATA = (
     "env_steps",
     "physics",
 )
+
+
+# What files of older code do not say: what skills see of the robot's observation ("robot": all), and its entries.
+LATER = {"view", "names"}
 
 
 class SkillsError(ValueError):
@@ -67,7 +72,8 @@ def read_skills(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
     """
     try:
         content = checkpoint.load(Path(path))
-        return {key: content["metadata"][key] for key in METADATA}, content["policy"]
+        metadata = content["metadata"]
+        return {key: metadata[key] for key in (*METADATA, *(LATER & metadata.keys()))}, content["policy"]
     except (OSError, CheckpointError) as error:
         raise SkillsError(f"skills={path}: {error}") from error
     except KeyError as error:
@@ -89,7 +95,14 @@ def policy_of(path: Path) -> tuple[SkillPolicy, dict[str, Any]]:
         metadata["log_std_per_skill"],
     )
     policy.load_state_dict(tensors)
+    if view_of(metadata) == "ego":
+        policy.ego = Ego(metadata["names"])
     return policy, metadata
+
+
+def view_of(metadata: dict[str, Any]) -> str:
+    """What the skills of a file see of the robot's observation: robot or ego."""
+    return metadata.get("view", "robot")
 
 
 def load_skills(path: Path, policy: SkillPolicy, robot: str, observation: str) -> dict[str, Any]:
@@ -105,10 +118,11 @@ def load_skills(path: Path, policy: SkillPolicy, robot: str, observation: str) -
         SkillsError: the file cannot be read or does not fit; names what differs, the file's value and the wanted one.
     """
     metadata, tensors = read_skills(path)
-    wanted = {"robot": robot, "observation": observation} | network_of(policy)
+    view = "robot" if policy.ego is None else "ego"
+    wanted = {"robot": robot, "observation": observation, "view": view} | network_of(policy)
     for key, value in wanted.items():
-        if metadata[key] != value:
-            raise SkillsError(f"skills={path}: its {key} is {metadata[key]}, the policy's {value}")
+        if (has := view_of(metadata) if key == "view" else metadata[key]) != value:
+            raise SkillsError(f"skills={path}: its {key} is {has}, the policy's {value}")
     inputs = policy.first.inputs
     if inputs not in (metadata["obs_size"], metadata["obs_size"] + 1):
         raise SkillsError(

@@ -6,7 +6,7 @@ clipped noise and are not clipped back into the box. Source: tensorflow/models, 
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import torch
 from torch import Tensor, nn
@@ -40,10 +40,25 @@ class Actor(nn.Module):
             layer.bias = _uniform((sizes[i + 1],), bound, generator)
 
     def forward(self, x: Tensor) -> Tensor:
-        *hidden, last = self.layers
-        for layer in hidden:
-            x = layer(x).relu_()
-        return self.half_range * torch.tanh(last(x))
+        return self._of_first(self.layers[0](x))
+
+    def of_shifted(self, x: Tensor, shifts: Tensor) -> Iterator[Tensor]:
+        """mu of x (B, c, D) with each of M shifts (B, M, k) added to its last k entries: M times (B, c, A).
+
+        The first layer is linear: of all shifts together it is one product for x and one for the shifts. One at a time,
+        since the rows of one fit a core's cache.
+        """
+        first = self.layers[0]
+        assert isinstance(first, nn.Linear)
+        of_x, of_shift = first(x), shifts @ first.weight[:, -shifts.shape[-1] :].T
+        for i in range(shifts.shape[1]):
+            yield self._of_first((of_x + of_shift[:, i : i + 1]).flatten(0, 1)).unflatten(0, x.shape[:2])
+
+    def _of_first(self, hidden: Tensor) -> Tensor:
+        """Actions from what the first layer puts out, which is overwritten."""
+        for layer in self.layers[1:]:
+            hidden = layer(hidden.relu_())
+        return self.half_range * torch.tanh(hidden)
 
 
 class TwinCritics(nn.Module):

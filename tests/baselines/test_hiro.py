@@ -47,6 +47,10 @@ class Linear(nn.Module):
     def forward(self, x):
         return x @ self.weight.T
 
+    def of_shifted(self, x, shifts):
+        for i in range(shifts.shape[1]):
+            yield self(torch.cat([x[..., : -shifts.shape[-1]], x[..., -shifts.shape[-1] :] + shifts[:, i : i + 1]], -1))
+
 
 class Function(nn.Module):
     """A function in place of a network."""

@@ -194,7 +194,7 @@ def test_rows_are_written_as_pandas_writes_them(tmp_path):
     planned(tmp_path)
     written_rows(tmp_path, "iteration,env_steps,return_mean\n0,1,0.1\n1,2,inf\n2,3,nan\n3,4,1e-300\n4,5,-3\n")
     frame = runs.load("fig3", "smoke", tmp_path / "runs", tmp_path / "data").frame
-    curves.write_rows(frame, tmp_path / "rows.csv")
+    runs.write_rows(frame, tmp_path / "rows.csv")
     assert (tmp_path / "rows.csv").read_text() == frame.to_csv(index=False, lineterminator="\n")
 
 

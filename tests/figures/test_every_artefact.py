@@ -19,7 +19,7 @@ YAML = """\
 # @package _global_
 scale: tiny
 seeds: 1
-off_policy: {iterations: 2, batch_size: 40}
+off_policy: {steps: 80, batch_size: 40}
 budget:
 """
 OVERRIDES = ["algo.gamma=0.9", "algo.clip_range=0.2"]
