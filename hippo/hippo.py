@@ -9,7 +9,7 @@ where k runs over the manager's decisions and t over environment steps. Where to
     Algorithm 1, HiPPO Rollout                     hippo/core/hierarchy.py   collect
       lines 4, 5: draw p, then z ~ pi_h                                      Commitment.renew, Acting.decide
       lines 6 to 9: a ~ pi_l for p steps                                     Acting.action, Commitment.advance
-    settings of the hierarchy (n, p, networks)     hippo/core/hierarchy_config.py   HierarchyConfig
+    settings of the hierarchy (n, p, networks)     hippo/core/hierarchy_config.py  HierarchyConfig
     Algorithm 2, HiPPO                             here                      train
       line 4: N trajectories                       hippo/core/hierarchy.py   collect
       line 5: advantages of both levels (4.2)      hippo/core/advantages.py  advantages

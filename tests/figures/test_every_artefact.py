@@ -129,7 +129,7 @@ def test_a_figure_with_overrides_says_so_everywhere_and_touches_no_file_of_the_u
     name = Edition.of(SCALE, settings=OVERRIDES).name("fig3")
     stem = tmp_path / SCALE / "overridden" / name
     assert {path for path in after if path not in before} == {
-        stem.with_name(f"{name}.{kind}") for kind in ("csv", "png", "pdf", "svg", "caption.txt")
+        stem.with_name(f"{name}.{kind}") for kind in ("csv", "png", "pdf", "svg", "caption.txt", "clock.png")
     }
     said = "overridden: algo.clip_range=0.2, algo.gamma=0.9"
     assert said in after[stem.with_suffix(".caption.txt")].decode()

@@ -8,6 +8,7 @@ from hippo import hippo
 from hippo.core import checkpoint, seeding
 from hippo.core.checkpoint import Checkpoint, load
 from hippo.core.hierarchy import HierarchicalPolicy
+from hippo.core.optimizers import Adam
 from hippo.core.policies import SkillPolicy
 from hippo.core.skills import METADATA, SkillsError, load_skills, network_of, policy_of, read_skills, save_skills
 from tests.hippo.toy import run
@@ -145,7 +146,7 @@ def test_training_starts_from_the_skills_of_the_file(name, period_max, tmp_path,
     source = network(0, obs_size=2, hidden_sizes=(64, 64))
     save_skills(tmp_path / "s.pt", source, ABOUT)
     train, config = ALGORITHMS[name]
-    monkeypatch.setattr(torch.optim.Adam, "step", lambda self, *arguments: None)  # what training starts from
+    monkeypatch.setattr(Adam, "step", lambda self, *arguments: None)  # what training starts from
     settings = {"period_min": 5, "period_max": period_max, "skills": str(tmp_path / "s.pt")}
     run(train, config(**SMALL, **settings), tmp_path / "run")
     tensors = load(tmp_path / "run/checkpoint.pt")["policy"]

@@ -13,6 +13,7 @@ from hippo.core.checkpoint import Checkpoint, load
 from hippo.core.hierarchy import HierarchicalPolicy, collect
 from hippo.core.levels import levels
 from hippo.core.log import Diverged
+from hippo.core.optimizers import Adam
 from hippo.core.policies import GaussianPolicy
 from hippo.core.ppo import maximize
 from tests.hippo.toy import TargetEnv, progress, run
@@ -242,7 +243,7 @@ def test_a_nan_in_the_parameters_stops_the_run_within_the_iteration_and_reaches_
     name, tmp_path, monkeypatch
 ):
     train, config = learner(name, iterations=3, batch_size=200)
-    step = torch.optim.Adam.step
+    step = Adam.step
 
     def poisoned(self, *arguments):
         step(self, *arguments)
@@ -250,7 +251,7 @@ def test_a_nan_in_the_parameters_stops_the_run_within_the_iteration_and_reaches_
             with torch.no_grad():
                 self.param_groups[0]["params"][0].view(-1)[0] = float("nan")
 
-    monkeypatch.setattr(torch.optim.Adam, "step", poisoned)
+    monkeypatch.setattr(Adam, "step", poisoned)
     with pytest.raises(Diverged, match="iteration 1: parameters has"):
         run(train, config, tmp_path)
     assert (tmp_path / "progress.csv").read_text().count("\n") == 2
