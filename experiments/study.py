@@ -151,7 +151,7 @@ def table(study: Study, frame: pd.DataFrame) -> list[str]:
     """Final return and area of every variant, mean ± standard deviation over seeds, as Markdown lines.
 
     The score is the area relative to the mean over all variants in that environment, mean over environments; of those
-    that `over` makes of one variant the highest is bold.
+    that `over` makes of one variant the highest is bold, once all of their runs are there.
     """
     environments = list(study.description["environments"])
     labels = dict.fromkeys((e.group, e.variant) for e in study.entries)
@@ -173,7 +173,12 @@ def table(study: Study, frame: pd.DataFrame) -> list[str]:
         if all(counts[label, env] for env in environments)
     }
     groups = {group: [label for g, label in labels if g == group] for group, _ in labels}
-    best = {max(of, key=lambda label: score.get(label, -np.inf)) for of in groups.values() if len(of) > 1}
+    whole = {
+        label
+        for _, label in labels
+        if all(counts[label, env] >= len(study.description["seeds"]) for env in environments)
+    }
+    best = {max(of, key=score.__getitem__) for of in groups.values() if len(of) > 1 and whole.issuperset(of)}
     heads = [f"{env_label(env)}: seeds | final | area" for env in environments]
     lines = [f"| variant | {' | '.join(heads)} | score |", "|---|" + "---|" * (3 * len(environments) + 1)]
     for _, label in labels:
@@ -189,7 +194,7 @@ def table(study: Study, frame: pd.DataFrame) -> list[str]:
 
 def page(study: Study, frame: pd.DataFrame, picture: str) -> str:
     """The study's page."""
-    described = study.description
+    described, there = study.description, len({entry.run.run_id for entry in study.entries} & set(frame["run_id"]))
     return "\n".join(
         [
             f"# {described['title']}",
@@ -197,6 +202,7 @@ def page(study: Study, frame: pd.DataFrame, picture: str) -> str:
             f"Written by `python -m experiments.study show {study.name}`; `... run {study.name}` trains it.",
             "",
             described["text"].strip(),
+            *(["", f"**Not whole yet**: {there} of {len(study.entries)} runs."] if there < len(study.entries) else []),
             "",
             *table(study, frame),
             "",

@@ -2,6 +2,7 @@
 
 import json
 
+import pandas as pd
 import pytest
 
 from experiments import study
@@ -64,6 +65,13 @@ def test_the_table_worked_by_hand(trained, tmp_path, capsys):
     assert first in page
     assert second in page
     assert (tmp_path / "pages/two.png").stat().st_size > 10_000
+
+
+def test_a_study_that_is_not_whole_says_so_and_takes_no_choice(trained, tmp_path):
+    frame = pd.concat([study.rows_of(trained, entry) for entry in trained.entries[:-1]])
+    page = study.page(trained, frame, "two.png")
+    assert "**Not whole yet**: 7 of 8 runs." in page
+    assert "| **" not in page
 
 
 def test_without_rows_and_without_such_a_study_it_says_so(trained, tmp_path, capsys):
