@@ -21,9 +21,15 @@ from experiments.status import read_status
 from tests import ROOT
 
 pytestmark = pytest.mark.slow
-SETTINGS = ["algo=ppo", "env=block_hopper", "scale=smoke", "iterations=30", "batch_size=400"]
-CUTS, MEGABYTES = 6, 32
+ITERATIONS, CUTS, MEGABYTES = 30, 6, 32
+SETTINGS = ["algo=ppo", "env=block_hopper", "scale=smoke", f"iterations={ITERATIONS}", "batch_size=400"]
 RESULTS = ("progress.csv", "checkpoint.pt")
+
+
+def written(folder):
+    """Lines of a run's log."""
+    log = folder / "progress.csv"
+    return log.read_bytes().count(b"\n") if log.exists() else 0
 
 
 def do(*command):
@@ -72,14 +78,16 @@ def cut(image, copy, pid):
 
 def test_a_run_on_a_disk_whose_power_is_cut_goes_on_to_the_same_bytes(image, tmp_path):
     command = [sys.executable, "-m", "experiments.train", *SETTINGS, f"runs_dir={tmp_path / 'disk'}"]
-    copies, pauses = [], random.Random(0)
+    # So many lines of the log are there before each cut, and a moment more passes.
+    copies, lines, moments = [], range(1, ITERATIONS, ITERATIONS // CUTS), random.Random(0)
     with mounted(image, tmp_path / "disk") as disk:
         run = compose_run(SETTINGS, disk)
         with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL) as process:
-            while not (run.folder / "progress.csv").exists() and process.poll() is None:
-                time.sleep(0.01)
             while len(copies) < CUTS and process.poll() is None:
-                time.sleep(pauses.uniform(0.2, 1.2))
+                if written(run.folder) < lines[len(copies)]:
+                    time.sleep(0.001)
+                    continue
+                time.sleep(moments.uniform(0.0, 0.05))
                 copies.append(tmp_path / f"{len(copies)}.img")
                 cut(image, copies[-1], process.pid)
         assert process.returncode == 0
@@ -88,8 +96,7 @@ def test_a_run_on_a_disk_whose_power_is_cut_goes_on_to_the_same_bytes(image, tmp
     for copy in copies:
         with mounted(copy, tmp_path / "elsewhere") as elsewhere:
             again = compose_run(SETTINGS, elsewhere)
-            left = again.folder / "progress.csv"
-            found.append((read_status(again.folder)["state"], left.read_bytes().count(b"\n") if left.exists() else 0))
+            found.append((read_status(again.folder)["state"], written(again.folder)))
             assert train.execute(again) == "finished", found
             assert {name: (again.folder / name).read_bytes() for name in RESULTS} == whole, found
             assert read_status(again.folder)["state"] == "finished"
