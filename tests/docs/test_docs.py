@@ -53,9 +53,16 @@ def test_every_file_and_folder_of_tests_that_is_named_exists(page):
 
 
 def test_tests_are_run_by_the_group_and_a_wrong_one_is_one_line_that_names_the_choices():
-    right = subprocess.run(["make", "--dry-run", "test", "ONLY=envs docs"], cwd=ROOT, capture_output=True, text=True)
+    right = subprocess.run(
+        ["make", "--no-print-directory", "--dry-run", "test", "ONLY=envs docs"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+    )
     assert right.stdout.rstrip().endswith("tests/envs tests/docs")
-    wrong = subprocess.run(["make", "test", "ONLY=env"], cwd=ROOT, capture_output=True, text=True, check=False)
+    wrong = subprocess.run(
+        ["make", "--no-print-directory", "test", "ONLY=env"], cwd=ROOT, capture_output=True, text=True, check=False
+    )
     assert wrong.returncode == 2
     (line,) = wrong.stderr.splitlines()
     assert "ONLY=env is no group" in line
