@@ -70,7 +70,7 @@ def improvement(x: np.ndarray, y: np.ndarray) -> stats.Interval:
 
 def draw(results: Results, out: Path, rows: pd.DataFrame) -> list[Path]:
     """Write <figure>.aggregate.png and its caption; returns the paths, none where nothing can be drawn."""
-    peer = peer_scores(rows)
+    peer = peer_scores(rows[rows["env"].isin(curves.unique(results, "env"))])
     found = matrices(results, peer) if peer else {}
     if not found:
         return []

@@ -44,7 +44,8 @@ def test_scores_are_relative_to_the_peers_mean_and_the_picture_is_drawn(tmp_path
     plan = {"figure": "fig3", "scale": "laptop", "protocol": "modern", "title": "Title", "runs": runs}
     results = Results(plan, frame, [])
     assert aggregate.matrices(results, reached)["ppo"].tolist() == [[1.0, 1.0], [1.5, 1.5], [2.0, 2.0]]  # over 2
-    picture, caption = aggregate.draw(results, tmp_path, peer)
+    elsewhere = peer.assign(env="gym:Hopper-v5")  # kept in the same file, and none of the figure's tasks
+    picture, caption = aggregate.draw(results, tmp_path, pd.concat([peer, elsewhere]))
     assert picture.stat().st_size > 10_000
     assert "block_hopper 2.00 (2 seeds)" in caption.read_text()
     short = Results(plan, frame[frame["env_steps"] < 500_000], [])
