@@ -12,7 +12,8 @@ import pandas as pd
 
 from analysis.runs import Results
 
-AXIS = "hours of training"
+UNITS = {"hours of training": 1.0, "minutes of training": 1 / 60}  # of the axis, where two of them were trained
+SHORTEST = ("seconds of training", 1 / 3600)
 CAPTION = (
     "clock.png: the same curves by wall-clock, each run's own hours (physics, policy and updates) on the machine that "
     "trained it, where other runs may have shared the processor."
@@ -33,7 +34,7 @@ def by_clock(results: Results, runs_dir: Path) -> Results | None:
     clocked = pd.concat(parts, ignore_index=True)
     longest = clocked.groupby(["env", "variant"])["env_steps"].max().to_dict()
     runs = [run | {"env_steps": longest.get((run["env"], run["variant"]), 0.0)} for run in results.plan["runs"]]
-    return dataclasses.replace(results, plan=results.plan | {"runs": runs, "axis": AXIS}, frame=clocked)
+    return dataclasses.replace(results, plan=results.plan | {"runs": runs, "by_clock": True}, frame=clocked)
 
 
 def clocks(path: Path) -> np.ndarray:

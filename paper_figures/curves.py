@@ -23,7 +23,7 @@ from analysis import stats
 from analysis.edition import PAPER, Edition
 from analysis.runs import Results, scores, write_rows
 from paper_figures import command_line, style
-from paper_figures.clock import CAPTION, by_clock
+from paper_figures.clock import CAPTION, SHORTEST, UNITS, by_clock
 
 MOST_POINTS = 2000  # of a curve that are drawn, several for every pixel
 SHORTER = 0.95  # methods whose budget is below this share of the longest have their last value held
@@ -286,8 +286,8 @@ def draw_curves(axes: Axes, results: Results, env: str, share: float) -> None:
     """The learning curves of one environment with their axes."""
     steps = results.frame.loc[results.frame["env"] == env, "env_steps"]
     unit, name = (1e6, "million env. steps") if steps.max() >= 5e5 else (1e3, "thousand env. steps")
-    if "axis" in results.plan:
-        unit, name = 1, results.plan["axis"]
+    if results.plan.get("by_clock"):
+        name, unit = next(((what, hours) for what, hours in UNITS.items() if steps.max() >= 2 * hours), SHORTEST)
     draw_panel(axes, results, env, unit, share)
     axes.set_xlabel(name)
     axes.set_xlim(left=0)
